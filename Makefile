@@ -1,0 +1,35 @@
+# make demo | test | lint | gates | bench
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/installed.stamp
+
+.PHONY: demo test lint gates bench clean
+# constraints.txt pins what was tested on one Python version; other versions resolve freely.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "gonio needs Python 3.11 or newer; say which with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	@if $(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'; then pin="-c constraints.txt"; fi; \
+	  echo $(BIN)/pip install -e '.[test]' $$pin; $(BIN)/pip install --quiet --disable-pip-version-check -e '.[test]' $$pin
+	@touch $@
+
+demo: $(STAMP)
+	$(BIN)/gonio demo --out runs/demo
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -m "not gate"
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+gates: $(STAMP)
+	$(BIN)/python -m pytest -m gate -s
+
+bench: $(STAMP)
+	$(BIN)/python -m tests.benchmarks
+
+clean:
+	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
