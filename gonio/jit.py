@@ -1,0 +1,132 @@
+"""Kernels compiled from model functions, cached on disk and never stale.
+
+Numba's own cache looks at the file of the kernel only: after an edit of a model that the kernel calls it loads the old
+machine code. Here the key is a fingerprint of the loaded code of the kernel and of everything it calls, with its
+constants, so an edit anywhere recompiles and an undone edit hits again. Each kernel has an index file of its own, so
+processes that start together cannot pick up each other's code. A damaged or read-only cache means compiling again.
+
+This leans on private parts of numba (`FunctionCache`); tests/unit/test_jit.py shows that a second process hits and that
+edits miss.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core import caching
+from numba.core.dispatcher import Dispatcher
+
+# reassoc lets sums vectorise; no nnan and no ninf, so NaN and infinity stay what they are
+FAST = {"reassoc", "nsz", "contract", "arcp"}
+_PURE = ("math", "numpy", "numba", "builtins")
+_compiled = 0  # kernels compiled, not loaded, by this process
+
+
+def compiled_count() -> int:
+    """How many kernels this process had to compile because the cache did not hold them."""
+    return _compiled
+
+
+def model(function: Callable[..., Any]) -> Any:
+    """Compile a scalar model function: IEEE order kept inside, inlined into the kernels that call it."""
+    return numba.njit(error_model="numpy", fastmath=False)(function)
+
+
+def kernel(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile a kernel and keep its machine code on disk.
+
+    Parameters
+    ----------
+    function : callable
+        May close over functions compiled by `model`, numbers, strings, tuples and arrays.
+    **options
+        Passed to ``numba.njit``.
+
+    Raises
+    ------
+    TypeError
+        If the function uses an object whose content cannot be fingerprinted.
+    """
+    options = {"error_model": "numpy", "fastmath": FAST, "nogil": True} | options
+    compiled = numba.njit(**options)(function)
+    shown = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in options.items())
+    text = repr([numba.__version__, shown, _fingerprint(function, set())])
+    compiled._cache = _Cache(function, hashlib.sha256(text.encode()).hexdigest(), cache_folder())
+    return compiled
+
+
+def cache_folder() -> Path:
+    """Where kernels are kept: ``$NUMBA_CACHE_DIR``, else ``$XDG_CACHE_HOME``, else ``~/.cache``, then ``gonio``."""
+    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "gonio"
+
+
+def _fingerprint(value: Any, seen: set[Any]) -> Any:
+    """What machine code made from `value` depends on: loaded code, constants and, recursively, the functions called."""
+    if isinstance(value, Dispatcher):
+        options = sorted((name, str(option)) for name, option in value.targetoptions.items())
+        return ["jit", options, _fingerprint(value.py_func, seen)]
+    if isinstance(value, types.CodeType):
+        constants = [_fingerprint(constant, seen) for constant in value.co_consts]
+        return [value.co_code, value.co_names, value.co_varnames, value.co_freevars, constants]
+    if isinstance(value, types.FunctionType):
+        if value in seen:
+            return "seen"
+        seen.add(value)
+        cells = (cell.cell_contents for cell in value.__closure__ or ())
+        used = dict(zip(value.__code__.co_freevars, cells, strict=True))
+        used |= {name: value.__globals__[name] for name in value.__code__.co_names if name in value.__globals__}
+        return [value.__defaults__, _fingerprint(value.__code__, seen), [(n, _fingerprint(v, seen)) for n, v in sorted(used.items())]]
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, value.shape, value.tobytes()]
+    if isinstance(value, tuple | frozenset):
+        return [type(value).__name__, [_fingerprint(item, seen) for item in value]]
+    if isinstance(value, bool | int | float | complex | str | bytes | types.NoneType):
+        return value
+    if str(getattr(value, "__module__", getattr(value, "__name__", ""))).split(".")[0] in _PURE:
+        return repr(getattr(value, "__name__", value))
+    raise TypeError(f"a kernel may not use {value!r}: import the function or the number by name")
+
+
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    def __init__(self, function: Callable[..., Any], key: str, folder: Path) -> None:
+        self._name, self._py_func, self._key = function.__qualname__, function, key
+        self._cache_path = str(folder)
+        self._impl = object.__new__(caching.CompileResultCacheImpl)
+        ensure = types.SimpleNamespace(ensure_cache_path=lambda: folder.mkdir(parents=True, exist_ok=True))
+        self._impl._locator = ensure
+        index = f"{function.__name__}-{key[:24]}.{sys.implementation.cache_tag}"
+        self._cache_file = caching.IndexDataCacheFile(self._cache_path, index, key)
+        self.enable()
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return sig, codegen.magic_tuple(), self._key
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        global _compiled
+        try:
+            loaded = super().load_overload(sig, target_context)
+        except Exception:  # noqa: BLE001  whatever a damaged file raises: compile again
+            loaded = None
+        if loaded is None:
+            _compiled += 1
+        return loaded
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        for _ in range(2):
+            try:
+                super().save_overload(sig, data)
+                return
+            except Exception:  # noqa: BLE001  damaged index: start it again
+                try:
+                    self.flush()
+                except OSError:  # read-only or full disk: go on uncached
+                    return

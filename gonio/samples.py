@@ -1,0 +1,149 @@
+r"""BRDF samples: what a measurement knows, with its random and its shared errors kept apart.
+
+A random error belongs to one sample. A shared error (the scale of the white reference, the zero of an axis) is the same
+unknown number for all samples, so it is neither averaged away nor added to the scatter: it is a parameter with a prior,
+and each sample carries its derivatives with respect to it. The expected reading of sample j is
+
+.. math:: \hat f_j = f_r(\omega_i + \sum_k \partial_k\omega_i\,\delta_k,\ \omega_r + \sum_k \partial_k\omega_r\,\delta_k)
+          \exp\Bigl(\sum_k \partial_k\ln f\,\delta_k\Bigr), \qquad \delta_k \sim N(0, u_k).
+
+The split into random, structured and systematic errors follows the GUM: JCGM 100:2008, 5.2 (correlated quantities).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gonio.errors import DatasetError
+from gonio.geometry import unit_vector
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SharedError:
+    """One error that all samples share.
+
+    Attributes
+    ----------
+    name : str
+        ``"scale"``, ``"arm"``, ``"pan"``, ``"tilt"``, ...
+    u : float
+        Standard uncertainty of the shared value, the prior of the fit.
+    u_sample : float
+        Standard deviation of an independent error of the same kind in every sample, such as encoder quantisation.
+    unit : str
+        ``"1"`` or ``"rad"``.
+    """
+
+    name: str
+    u: float
+    u_sample: float = 0.0
+    unit: str = "1"
+
+
+@dataclass(frozen=True)
+class BRDFSamples:
+    """Scattered samples of a BRDF.
+
+    Attributes
+    ----------
+    theta_i, phi_i, theta_r, phi_r : ndarray, shape (n,)
+        Incident and reflected direction [rad], from the normal; mirror direction at phi_r = phi_i + pi.
+    f_r : ndarray, shape (n,)
+        BRDF [1/sr]. Negative values are kept: noise around zero is data.
+    u_f_r : ndarray, shape (n,)
+        Standard random uncertainty of f_r [1/sr]; NaN where it is unknown.
+    pose : ndarray of int64, shape (n,)
+        Pose of the scan that gave the sample, -1 if none.
+    shared : tuple of SharedError, length K
+    d_omega_i, d_omega_r : ndarray, shape (n, 3, K)
+        Derivatives of the unit vectors, in the local frame, with respect to each shared error.
+    d_ln_f : ndarray, shape (n, K)
+        Derivative of the logarithm of the reading with respect to each shared error, directions held.
+    attributes : mapping of str to str
+        Quantity, material, origin.
+    """
+
+    theta_i: Array
+    phi_i: Array
+    theta_r: Array
+    phi_r: Array
+    f_r: Array
+    u_f_r: Array
+    pose: NDArray[np.int64]
+    shared: tuple[SharedError, ...]
+    d_omega_i: Array
+    d_omega_r: Array
+    d_ln_f: Array
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, k = len(self.f_r), len(self.shared)
+        shapes: dict[str, tuple[int, ...]] = {
+            "theta_i": (n,), "phi_i": (n,), "theta_r": (n,), "phi_r": (n,), "f_r": (n,), "u_f_r": (n,), "pose": (n,),
+            "d_omega_i": (n, 3, k), "d_omega_r": (n, 3, k), "d_ln_f": (n, k),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise DatasetError(f"samples: {name} has shape {array.shape}, needed is {shape}")
+            if name != "u_f_r" and not np.all(np.isfinite(array)):
+                raise DatasetError(f"samples: {name} holds a value that is not finite; remove those rows first")
+        if np.any(np.isinf(self.u_f_r)) or np.any(self.u_f_r < 0):
+            raise DatasetError("samples: u_f_r must be zero, positive or NaN (unknown)")
+        for name in ("theta_i", "theta_r"):
+            theta = getattr(self, name)
+            if np.any((theta < 0) | (theta >= np.pi / 2)):
+                worst = np.degrees(theta[(theta < 0) | (theta >= np.pi / 2)][0])
+                raise DatasetError(f"samples: {name} = {worst:g} degrees; a BRDF needs 0 <= {name} < 90 degrees")
+
+    def __len__(self) -> int:
+        return len(self.f_r)
+
+    def omega_i(self) -> Array:
+        """Incident unit vectors in the local frame, shape (n, 3)."""
+        return unit_vector(self.theta_i, self.phi_i)
+
+    def omega_r(self) -> Array:
+        """Reflected unit vectors in the local frame, shape (n, 3)."""
+        return unit_vector(self.theta_r, self.phi_r)
+
+    def select(self, mask: NDArray[np.bool_] | NDArray[np.int64]) -> BRDFSamples:
+        """The samples of a mask or of an index array."""
+        arrays = {f.name: getattr(self, f.name)[mask] for f in fields(self) if f.name not in ("shared", "attributes")}
+        return replace(self, **arrays)
+
+    @classmethod
+    def plain(
+        cls,
+        theta_i: ArrayLike,
+        phi_i: ArrayLike,
+        theta_r: ArrayLike,
+        phi_r: ArrayLike,
+        f_r: ArrayLike,
+        u_f_r: ArrayLike | None = None,
+        attributes: Mapping[str, str] | None = None,
+    ) -> BRDFSamples:
+        """Samples without poses and shared errors, as imported ones are.
+
+        Parameters
+        ----------
+        theta_i, phi_i, theta_r, phi_r : array_like, shapes broadcast to (n,)
+            [rad].
+        f_r : array_like, shape (n,)
+            [1/sr].
+        u_f_r : array_like, shape (n,), optional
+            Standard uncertainty [1/sr]; NaN, and NaN everywhere by default, where unknown.
+        """
+        value = np.array(f_r, dtype=float)
+        n = len(value)
+        a, b, c, d = (np.array(np.broadcast_to(np.asarray(x, dtype=float), (n,))) for x in (theta_i, phi_i, theta_r, phi_r))
+        u = np.full(n, np.nan) if u_f_r is None else np.array(np.broadcast_to(np.asarray(u_f_r, dtype=float), (n,)))
+        none = np.zeros((n, 3, 0))
+        pose = np.full(n, -1, dtype=np.int64)
+        return cls(a, b, c, d, value, u, pose, (), none, none, np.zeros((n, 0)), dict(attributes or {}))
