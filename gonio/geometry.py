@@ -184,5 +184,7 @@ def _gradient(p: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
     if np.any(np.isnan(p)) or np.any(np.isnan(q)):
         raise GeometryError("a gradient is NaN: give finite p and q")
     if np.any(np.isinf(p) & np.isinf(q)):
-        raise GeometryError("p and q are both infinite, so the direction of the slope is undefined: give one of them finite")
+        raise GeometryError(
+            "p and q are both infinite, so the direction of the slope is undefined: give one of them finite"
+        )
     return p, q

@@ -84,7 +84,11 @@ def _fingerprint(value: Any, seen: set[Any]) -> Any:
         cells = (cell.cell_contents for cell in value.__closure__ or ())
         used = dict(zip(value.__code__.co_freevars, cells, strict=True))
         used |= {name: value.__globals__[name] for name in value.__code__.co_names if name in value.__globals__}
-        return [value.__defaults__, _fingerprint(value.__code__, seen), [(n, _fingerprint(v, seen)) for n, v in sorted(used.items())]]
+        return [
+            value.__defaults__,
+            _fingerprint(value.__code__, seen),
+            [(n, _fingerprint(v, seen)) for n, v in sorted(used.items())],
+        ]
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, value.tobytes()]
     if isinstance(value, tuple | frozenset):

@@ -142,7 +142,9 @@ class BRDFSamples:
         """
         value = np.array(f_r, dtype=float)
         n = len(value)
-        a, b, c, d = (np.array(np.broadcast_to(np.asarray(x, dtype=float), (n,))) for x in (theta_i, phi_i, theta_r, phi_r))
+        a, b, c, d = (
+            np.array(np.broadcast_to(np.asarray(x, dtype=float), (n,))) for x in (theta_i, phi_i, theta_r, phi_r)
+        )
         u = np.full(n, np.nan) if u_f_r is None else np.array(np.broadcast_to(np.asarray(u_f_r, dtype=float), (n,)))
         none = np.zeros((n, 3, 0))
         pose = np.full(n, -1, dtype=np.int64)

@@ -1,0 +1,56 @@
+"""BRDF models: make one by name, add them up."""
+
+from __future__ import annotations
+
+from gonio.brdf.base import BRDF, Model, Parameter, Term, _suggest, term_names
+from gonio.brdf.lambertian import LAMBERTIAN
+from gonio.brdf.microfacet import GGX
+from gonio.brdf.specular import SPECULAR
+from gonio.errors import ParameterError
+
+__all__ = ["BRDF", "Model", "Parameter", "Term", "make", "models", "parse", "term_names"]
+
+_MODELS = {model.name: model for model in (LAMBERTIAN, GGX, SPECULAR)}
+
+
+def models() -> dict[str, Model]:
+    """All registered models by name."""
+    return dict(_MODELS)
+
+
+def make(name: str, **parameters: float) -> BRDF:
+    """A BRDF of one model.
+
+    Parameters
+    ----------
+    name : str
+        A key of `models`.
+    **parameters : float
+        All parameters of the model; angles in radians.
+
+    Raises
+    ------
+    ParameterError
+        If the name or a parameter is unknown, missing or outside its range.
+
+    Examples
+    --------
+    >>> make("lambertian", albedo=0.8) + make("ggx", k_s=1.0, alpha=0.3, f_0=0.04)
+    lambertian(albedo=0.8) + ggx(k_s=1, alpha=0.3, f_0=0.04)
+    """
+    model = find(name)
+    return BRDF([Term(model, model.values(parameters))])
+
+
+def find(name: str) -> Model:
+    """The registered model of that name, or a `ParameterError` with the nearest one."""
+    if name not in _MODELS:
+        raise ParameterError(
+            f"there is no BRDF model {name!r}{_suggest(name, _MODELS)}; known are: {', '.join(sorted(_MODELS))}"
+        )
+    return _MODELS[name]
+
+
+def parse(expression: str) -> tuple[Model, ...]:
+    """The models of a sum such as ``"lambertian+ggx"``."""
+    return tuple(find(part.strip()) for part in expression.split("+"))

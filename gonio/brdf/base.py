@@ -1,0 +1,254 @@
+"""What a BRDF is: a weighted sum of terms, each a model with its parameters.
+
+A model is one scalar function of two unit vectors in the local frame (normal along +z) and a parameter array; batch
+evaluation, likelihood and integrator are compiled from it. It returns 0 below the horizon, never NaN. A BRDF is never
+multiplied by a cosine here.
+
+References
+----------
+.. [1] F. E. Nicodemus et al., "Geometrical Considerations and Nomenclature for Reflectance", NBS Monograph 160, 1977.
+   doi:10.6028/NBS.MONO.160
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gonio import jit
+from gonio.errors import GeometryError, ParameterError
+from gonio.geometry import unit_vector
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Declaration of one parameter of a model.
+
+    Attributes
+    ----------
+    name, unit, doc : str
+    lower, upper : float
+        Closed range.
+    prior : tuple
+        Default prior of a fit: ``("uniform", lower, upper)`` or ``("log_normal", mean of ln, sd of ln)``, cut to the range.
+    fixed : float, optional
+        Value at which a fit holds the parameter unless it is freed.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    doc: str
+    prior: tuple[str, float, float]
+    unit: str = "1"
+    fixed: float | None = None
+
+    def check(self, value: float, owner: str) -> float:
+        """The value as float, or a `ParameterError` naming what is allowed."""
+        number = float(value)
+        if not (math.isfinite(number) and self.lower <= number <= self.upper):
+            raise ParameterError(
+                f"{owner}: {self.name} = {number:g} is outside [{self.lower:g}, {self.upper:g}] {self.unit}; choose one inside"
+            )
+        return number
+
+
+@dataclass(frozen=True)
+class Model:
+    """Declaration of a BRDF model.
+
+    Attributes
+    ----------
+    name, doc, reference : str
+    parameters : tuple of Parameter
+        In the order of the parameter array.
+    function : callable
+        ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function.
+    lobe_width : callable, optional
+        Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
+        angle; the integrator lays its nodes by it. None: no lobe.
+    diffuse : bool
+        f_r is the same for all pairs of directions (Lambert).
+    isotropic, reciprocal, energy_bounded : bool
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    function: Callable[..., float] | None
+    doc: str
+    reference: str
+    lobe_width: Callable[[Array], float] | None = None
+    diffuse: bool = False
+    isotropic: bool = True
+    reciprocal: bool = True
+    energy_bounded: bool = True
+
+    def values(self, given: Mapping[str, float]) -> Array:
+        """Parameter array from named values; every parameter must be given, and no other."""
+        names = [parameter.name for parameter in self.parameters]
+        for name in given:
+            if name not in names:
+                raise ParameterError(
+                    f"{self.name} has no parameter {name!r}{_suggest(name, names)}; it has: {', '.join(names)}"
+                )
+        missing = [name for name in names if name not in given]
+        if missing:
+            raise ParameterError(
+                f"{self.name} needs {', '.join(missing)} as well; its parameters are: {', '.join(names)}"
+            )
+        return np.array([parameter.check(given[parameter.name], self.name) for parameter in self.parameters])
+
+
+@dataclass(frozen=True)
+class Term:
+    """One model with its parameter array and a weight."""
+
+    model: Model
+    values: Array
+    weight: float = 1.0
+
+    def lobe_width(self) -> float | None:
+        """Half width of the term's lobe [rad], None without one."""
+        return None if self.model.lobe_width is None else float(self.model.lobe_width(self.values))
+
+
+class BRDF:
+    """A sum of terms.
+
+    Examples
+    --------
+    >>> import gonio
+    >>> paper = gonio.brdf.make("lambertian", albedo=0.5)
+    >>> round(float(paper.f_r(0.3, 0.0, 0.9, 3.0)) * math.pi, 15)
+    0.5
+    """
+
+    def __init__(self, terms: Iterable[Term]) -> None:
+        self.terms = tuple(terms)
+        if not self.terms:
+            raise ParameterError("a BRDF needs at least one term")
+
+    def __add__(self, other: BRDF) -> BRDF:
+        if not isinstance(other, BRDF):
+            return NotImplemented
+        return BRDF(self.terms + other.terms)
+
+    def __mul__(self, factor: float) -> BRDF:
+        if not isinstance(factor, int | float | np.floating):
+            return NotImplemented
+        if not (math.isfinite(factor) and factor >= 0):
+            raise ParameterError(f"a BRDF cannot be scaled by {factor:g}; use a finite factor >= 0")
+        return BRDF(Term(t.model, t.values, t.weight * float(factor)) for t in self.terms)
+
+    __rmul__ = __mul__
+
+    def __repr__(self) -> str:
+        shown = []
+        for name, term in zip(term_names(t.model for t in self.terms), self.terms, strict=True):
+            pairs = ", ".join(f"{p.name}={v:.6g}" for p, v in zip(term.model.parameters, term.values, strict=False))
+            shown.append(("" if term.weight == 1.0 else f"{term.weight:g} * ") + f"{name}({pairs})")
+        return " + ".join(shown)
+
+    @property
+    def name(self) -> str:
+        """Names of the models joined by ``+``."""
+        return "+".join(term.model.name for term in self.terms)
+
+    def parameters(self) -> dict[str, float]:
+        """Qualified parameter values, such as ``{"ggx.alpha": 0.3}``."""
+        return {
+            f"{name}.{parameter.name}": float(value)
+            for name, term in zip(term_names(t.model for t in self.terms), self.terms, strict=True)
+            for parameter, value in zip(term.model.parameters, term.values, strict=False)
+        }
+
+    def f_r(self, theta_i: ArrayLike, phi_i: ArrayLike, theta_r: ArrayLike, phi_r: ArrayLike) -> Array:
+        """BRDF value, as defined in [1]_.
+
+        Parameters
+        ----------
+        theta_i, phi_i, theta_r, phi_r : array_like, shapes broadcast to (...)
+            Incident and reflected direction from the normal [rad]; mirror direction at phi_r = phi_i + pi.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            [1/sr]; 0 where a direction is at or below the horizon.
+
+        Raises
+        ------
+        GeometryError
+            If an angle is not finite or a polar angle is outside [0, pi].
+        """
+        for name, theta in (("theta_i", theta_i), ("theta_r", theta_r)):
+            t = np.asarray(theta, dtype=float)
+            if np.any(~((t >= 0) & (t <= np.pi))):
+                raise GeometryError(
+                    f"{name} must be within 0 and 180 degrees; got {np.degrees(t[~((t >= 0) & (t <= np.pi))].flat[0]):g}"
+                )
+        if not (np.all(np.isfinite(phi_i)) and np.all(np.isfinite(phi_r))):
+            raise GeometryError("phi_i and phi_r must be finite")
+        return self.evaluate(unit_vector(theta_i, phi_i), unit_vector(theta_r, phi_r))
+
+    def evaluate(self, omega_i: ArrayLike, omega_r: ArrayLike) -> Array:
+        """BRDF value for unit vectors in the local frame.
+
+        Parameters
+        ----------
+        omega_i, omega_r : array_like, shapes broadcast to (..., 3)
+
+        Returns
+        -------
+        ndarray, shape (...)
+            [1/sr].
+        """
+        wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
+        flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
+        out = np.zeros(len(flat_i))
+        for term in self.terms:
+            accumulate(term.model)(flat_i, flat_r, term.values, term.weight, out)
+        return out.reshape(wi.shape[:-1])
+
+
+def accumulate(model: Model) -> Any:
+    """Compiled ``kernel(omega_i (n, 3), omega_r (n, 3), p, weight, out (n,))`` that adds weight * f_r to `out`."""
+    if model.function is None:
+        raise ParameterError(
+            f"{model.name} is a delta function and has no value at a pair of directions; use it in a reflectance map"
+        )
+    return _accumulate(model.function)
+
+
+@functools.cache
+def _accumulate(function: Callable[..., float]) -> Any:
+    def accumulate_terms(omega_i, omega_r, p, weight, out):  # type: ignore[no-untyped-def]
+        for k in range(out.size):
+            out[k] += weight * function(
+                omega_i[k, 0], omega_i[k, 1], omega_i[k, 2], omega_r[k, 0], omega_r[k, 1], omega_r[k, 2], p
+            )
+
+    return jit.kernel(accumulate_terms)
+
+
+def term_names(models: Iterable[Model]) -> tuple[str, ...]:
+    """Names that tell terms apart: ``ggx``, then ``ggx2`` for a second term of the same model."""
+    count: dict[str, int] = {}
+    names = []
+    for model in models:
+        count[model.name] = count.get(model.name, 0) + 1
+        names.append(model.name + (str(count[model.name]) if count[model.name] > 1 else ""))
+    return tuple(names)
+
+
+def _suggest(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
