@@ -84,7 +84,7 @@ def jacobian(arm: ArrayLike, pan: ArrayLike, tilt: ArrayLike) -> tuple[Array, Ar
     Returns
     -------
     d_omega_i, d_omega_r : ndarray, shape (..., 3, 3)
-        ``d_omega[..., k, j]`` is the derivative of local component k with respect to joint j of (arm, pan, tilt) [1/rad].
+        ``d_omega[..., k, j]``: derivative of component k with respect to joint j of (arm, pan, tilt) [1/rad].
     """
     arm, pan, tilt = _joints(arm, pan, tilt)
     i_angle, i_tilt = _circle_slopes(arm - pan, tilt)
@@ -121,7 +121,8 @@ class Solutions:
         """The distinct solutions of a single geometry (shape () only)."""
         if self.separation.shape != ():
             raise GeometryError(f"joints() lists one geometry, this holds {self.separation.shape}; use the arrays")
-        return [Joints(float(self.arm[k]), float(self.pan[k]), float(self.tilt[k])) for k in np.flatnonzero(self.distinct)]
+        rows = np.stack((self.arm, self.pan, self.tilt), axis=-1)[self.distinct]
+        return [Joints(float(arm), float(pan), float(tilt)) for arm, pan, tilt in rows]
 
 
 def inverse(theta_i: ArrayLike, theta_r: ArrayLike, dphi: ArrayLike) -> Solutions:
