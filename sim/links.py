@@ -1,0 +1,332 @@
+"""Ways from another program to a simulated device: a pseudo-terminal or a TCP socket.
+
+A device is anything with ``feed(data, t) -> [(delay, reply), ...]`` and ``idle()``: the servo bus and the lamp. The
+links run on a `ScaledClock`, have file descriptors and never block; `Pump` is the loop that drives them, together with
+any other object of the same shape (`Link`).
+
+They do not pace bytes: a reply leaves when its delay is over, in scaled time, and all at once. Pseudo-terminals need a
+Unix; nothing else here does. For a device inside the same process see `sim.port`.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+from gonio.errors import DeviceError
+from sim.clock import ScaledClock
+
+IDLE_S = 0.1  # wall time of silence after which servos forget an unfinished packet; they themselves wait 1.5 ms
+
+
+class Device(Protocol):
+    """What stands at the far end of a line."""
+
+    def feed(self, data: bytes, t: float) -> list[tuple[float, bytes]]:
+        """Take bytes that arrived at rig time `t` [s]; return replies with their delays [s], in order."""
+        ...
+
+    def idle(self) -> None:
+        """The line was silent for a while."""
+        ...
+
+
+class Link(Protocol):
+    """What a `Pump` drives. All times are the wall's, `time.monotonic`."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the pump should forget it."""
+        ...
+
+    def fileno(self) -> int: ...
+
+    def on_readable(self) -> Iterable[Link]:
+        """Data is there; never blocks. Returns links to be driven from now on, such as an accepted connection."""
+        ...
+
+    def due(self) -> float | None:
+        """When `on_due` should be called next; None for never."""
+        ...
+
+    def on_due(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Pump:
+    """A selectors loop over links.
+
+    Examples
+    --------
+    ::
+
+        pump = Pump(PtyLink(bus, clock), PtyLink(lamp, clock))
+        pump.run(lambda: stop.is_set())
+    """
+
+    def __init__(self, *links: Link) -> None:
+        self._selector = selectors.DefaultSelector()
+        self._links: list[Link] = []
+        for link in links:
+            self.add(link)
+
+    def add(self, link: Link) -> None:
+        """Drive this link too."""
+        self._selector.register(link.fileno(), selectors.EVENT_READ, link)
+        self._links.append(link)
+
+    def step(self, timeout: float) -> None:
+        """Wait for data or a due reply, at most `timeout` wall seconds, and serve it."""
+        now = time.monotonic()
+        dues = [due for link in self._links if (due := link.due()) is not None]
+        wait = max(0.0, min([timeout, *(due - now for due in dues)]))
+        for key, _ in self._selector.select(wait):
+            for new in key.data.on_readable():
+                self.add(new)
+        now = time.monotonic()
+        for link in list(self._links):
+            due = link.due()
+            if due is not None and due <= now:
+                link.on_due()
+            if link.closed:
+                self._forget(link)
+
+    def run(self, stop: Callable[[], bool], poll_s: float = 0.05) -> None:
+        """Step until `stop` says so."""
+        while not stop():
+            self.step(poll_s)
+
+    def close(self) -> None:
+        """Close all links."""
+        for link in list(self._links):
+            self._forget(link)
+            link.close()
+        self._selector.close()
+
+    def _forget(self, link: Link) -> None:
+        self._links.remove(link)
+        for key in list(self._selector.get_map().values()):
+            if key.data is link:
+                self._selector.unregister(key.fileobj)
+
+
+class _StreamLink:
+    """A device behind a descriptor, with a queue of replies that are not due yet."""
+
+    def __init__(self, device: Device, clock: ScaledClock) -> None:
+        self._device = device
+        self._clock = clock
+        self._queue: deque[tuple[float, bytes]] = deque()
+        self._unsent = b""
+        self._heard = 0.0
+        self.closed = False
+
+    def due(self) -> float | None:
+        if self._unsent:
+            return time.monotonic() + 0.001
+        return self._queue[0][0] if self._queue else None
+
+    def on_due(self) -> None:
+        now = time.monotonic()
+        while self._queue and self._queue[0][0] <= now:
+            self._unsent += self._queue.popleft()[1]
+        self._flush()
+
+    def _receive(self, data: bytes) -> None:
+        now = time.monotonic()
+        if now - self._heard > IDLE_S:
+            self._device.idle()
+        self._heard = now
+        for delay, reply in self._device.feed(data, self._clock.now()):
+            last = self._queue[-1][0] if self._queue else now
+            self._queue.append((max(last, now + delay / self._clock.speed), reply))
+        self.on_due()
+
+    def _flush(self) -> None:
+        if self._unsent:
+            with suppress(BlockingIOError):
+                self._unsent = self._unsent[self._write(self._unsent) :]
+
+    def _write(self, data: bytes) -> int:
+        raise NotImplementedError
+
+
+class PtyLink(_StreamLink):
+    """A device on a pseudo-terminal.
+
+    Parameters
+    ----------
+    device : Device
+    clock : ScaledClock
+    symlink : path, optional
+        A stable name for the terminal, made anew if it is a left-over link.
+
+    Attributes
+    ----------
+    path : str
+        What a client opens: `symlink`, or the terminal's own name.
+
+    Raises
+    ------
+    DeviceError
+        If this system has no pseudo-terminals, or `symlink` is something that is not a link.
+    """
+
+    def __init__(self, device: Device, clock: ScaledClock, symlink: str | Path | None = None) -> None:
+        super().__init__(device, clock)
+        try:
+            import pty
+            import tty
+        except ImportError as error:
+            raise DeviceError("This system has no pseudo-terminals; serve the simulator over TCP instead.") from error
+        self._master, self._slave = pty.openpty()
+        # Raw before the first client, or the line discipline would echo. The slave stays open, or reads of the master
+        # would fail whenever no client is connected.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        self._symlink: Path | None = None
+        if symlink is not None:
+            self._make_symlink(Path(symlink))
+
+    def _make_symlink(self, name: Path) -> None:
+        if name.exists() and not name.is_symlink():
+            self.close()
+            raise DeviceError(f"{name} exists and is no link; choose another name for the pseudo-terminal.")
+        fresh = name.with_name(f".{name.name}.{os.getpid()}")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(self.path)
+        fresh.replace(name)
+        self._symlink, self.path = name, str(name)
+
+    def fileno(self) -> int:
+        return self._master
+
+    def on_readable(self) -> Sequence[Link]:
+        try:
+            data = os.read(self._master, 65_536)
+        except BlockingIOError:
+            return ()
+        except OSError:  # the terminal is gone
+            self.closed = True
+            return ()
+        if data:
+            self._receive(data)
+        return ()
+
+    def _write(self, data: bytes) -> int:
+        return os.write(self._master, data)
+
+    def close(self) -> None:
+        """Close the terminal and take the symlink away."""
+        self.closed = True
+        if self._symlink is not None and self._symlink.is_symlink():
+            with suppress(OSError):
+                if self._symlink.readlink() == Path(os.ttyname(self._slave)):
+                    self._symlink.unlink()
+            self._symlink = None
+        for descriptor in (self._master, self._slave):
+            with suppress(OSError):
+                os.close(descriptor)
+
+
+class _Connection(_StreamLink):
+    """One client of a `TcpLink`."""
+
+    def __init__(self, device: Device, clock: ScaledClock, client: socket.socket) -> None:
+        super().__init__(device, clock)
+        self._socket = client
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def on_readable(self) -> Sequence[Link]:
+        try:
+            data = self._socket.recv(65_536)
+        except BlockingIOError:
+            return ()
+        except OSError:
+            data = b""
+        if data:
+            self._receive(data)
+        else:
+            self.close()
+        return ()
+
+    def _write(self, data: bytes) -> int:
+        try:
+            return self._socket.send(data)
+        except (BrokenPipeError, ConnectionResetError):
+            self.close()
+            return len(data)
+
+    def close(self) -> None:
+        self.closed = True
+        self._socket.close()
+
+
+class TcpLink:
+    """A device on a TCP port, for pyserial's ``socket://HOST:PORT``; a new client replaces the one before.
+
+    Parameters
+    ----------
+    device : Device
+    clock : ScaledClock
+    host : str, optional
+    port : int, optional
+        0 for any free one.
+
+    Attributes
+    ----------
+    address : tuple of (str, int)
+        Host and port.
+    """
+
+    def __init__(self, device: Device, clock: ScaledClock, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._device = device
+        self._clock = clock
+        self._client: _Connection | None = None
+        self.closed = False
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise DeviceError(f"Cannot listen on {host}:{port} ({error.strerror}); choose another port.") from error
+        self._listener.setblocking(False)
+        name = self._listener.getsockname()
+        self.address: tuple[str, int] = (name[0], name[1])
+
+    def fileno(self) -> int:
+        return self._listener.fileno()
+
+    def on_readable(self) -> Sequence[Link]:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return ()
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._client is not None:
+            self._client.close()
+        self._device.idle()
+        self._client = _Connection(self._device, self._clock, client)
+        return (self._client,)
+
+    def due(self) -> float | None:
+        return None
+
+    def on_due(self) -> None:
+        return
+
+    def close(self) -> None:
+        self.closed = True
+        self._listener.close()
+        if self._client is not None:
+            self._client.close()

@@ -1,0 +1,1 @@
+"""Handlers that pyserial finds by name for ``sim://`` URLs; the ports themselves are in `sim.port`."""
