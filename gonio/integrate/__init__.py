@@ -1,0 +1,244 @@
+r"""The shared integrator: reflected radiance of a BRDF under a source.
+
+.. math:: L_r = \int f_r(\omega_i, \omega_r)\,L_i(\omega_i)\,\max(0, \cos\theta_i)\,\mathrm{d}\omega_i
+
+R(p, q), scene radiance and albedo all come from here (memo, section 13). `plan` chooses; nothing that a scene does not
+need is computed.
+
+References
+----------
+.. [1] B. K. P. Horn, R. W. Sjoberg, "Calculating the Reflectance Map", MIT AI Memo 498, 1978.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gonio.brdf.base import BRDF
+from gonio.errors import GeometryError, IntegrationError, ParameterError
+from gonio.geometry import normal_from_gradient
+from gonio.integrate import closed_forms, radial
+from gonio.integrate.frames import Elements
+from gonio.integrate.plan import Method, Step, plan
+from gonio.integrate.quadrature import integrate_cap
+from gonio.source import Cap, Collimated, Source, uniform
+
+__all__ = ["Estimate", "MapValues", "directional_albedo", "plan", "reflectance_map", "scene_radiance"]
+
+Array = NDArray[np.float64]
+_FEW = 64  # distinct slopes below which a table in theta_n does not pay
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its error: `error` is an estimate that aims never to understate ``abs(value - truth)``."""
+
+    value: Array
+    error: Array
+
+
+@dataclass(frozen=True)
+class MapValues(Estimate):
+    """A reflectance map on given gradients.
+
+    Attributes
+    ----------
+    value, error : ndarray, shape of broadcast(p, q)
+        Scene radiance [W m^-2 sr^-1] without the impulses.
+    impulses : list of (p, q, weight)
+        Delta functions: weight is the coefficient of delta(p - p1) delta(q - q1).
+    plan : list of Step
+        What was done.
+    """
+
+    impulses: list[tuple[float, float, float]]
+    plan: list[Step]
+
+
+def reflectance_map(
+    brdf: BRDF, source: Source, p: ArrayLike, q: ArrayLike, rtol: float = 1e-6, atol: float = 0.0
+) -> MapValues:
+    r"""Reflectance map R(p, q): scene radiance as a function of the surface gradient.
+
+    Parameters
+    ----------
+    brdf : BRDF
+    source : Source
+        Viewer-oriented; the viewer looks along -z from far away.
+    p, q : array_like, shapes broadcast to (...)
+        Surface gradient dz/dx, dz/dy [1].
+    rtol, atol : float, optional
+        Relative and absolute [W m^-2 sr^-1] error requested.
+
+    Returns
+    -------
+    MapValues
+        ``.value``, ``.error`` of shape (...), ``.impulses``, ``.plan``.
+
+    Raises
+    ------
+    GeometryError
+        If a gradient is NaN or both of its components are infinite.
+    IntegrationError
+        If the tolerance is not met; ``exc.best`` is the `MapValues` reached, with its errors.
+
+    Examples
+    --------
+    A Lambertian surface under a hemispherical sky (memo, 14c):
+
+    >>> import gonio
+    >>> paper, sky = gonio.brdf.make("lambertian", albedo=1.0), gonio.source.make("hemispherical", radiance=1.0)
+    >>> round(float(reflectance_map(paper, sky, 0.75, 1.0).value), 12) == round((1 + 1 / math.sqrt(2.5625)) / 2, 12)
+    True
+    """
+    if not (math.isfinite(rtol) and rtol > 0 and math.isfinite(atol) and atol >= 0):
+        raise ParameterError(f"rtol = {rtol:g} and atol = {atol:g}: rtol must be positive, atol zero or positive")
+    p, q = np.broadcast_arrays(np.asarray(p, dtype=float), np.asarray(q, dtype=float))
+    elements = Elements.from_gradient(p.ravel(), q.ravel())
+    theta_n = normal_from_gradient(p.ravel(), q.ravel())[0]
+    value, error = np.zeros(len(elements)), np.zeros(len(elements))
+    impulses: list[tuple[float, float, float]] = []
+    steps = plan(brdf, source)
+    share = 1.0 / max(1, len(steps))
+    for step in steps:
+        start = time.perf_counter()
+        if step.method is Method.IMPULSE:
+            assert isinstance(step.part, Collimated)
+            impulses += closed_forms.mirror_beam(step.term, step.part)
+            continue
+        v, e = _run(step, elements, theta_n, rtol, atol * share)
+        value += v
+        error += e
+        step.seconds = time.perf_counter() - start
+        step.error = float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
+    result = MapValues(value.reshape(p.shape), error.reshape(p.shape), impulses, steps)
+    missed = error > np.maximum(rtol * np.abs(value), atol) * (1 + 1e-9) + 1e-300
+    if np.any(missed & (error > 1e-13 * np.max(np.abs(value), initial=0.0))):
+        worst = float(np.max(np.divide(error, np.abs(value), out=np.zeros_like(error), where=value != 0)))
+        raise IntegrationError(
+            f"reflectance map: reached a relative error of {worst:.1e} where {rtol:.1e} was asked for, at "
+            f"{int(missed.sum())} of {len(value)} gradients; ask for a larger rtol or use the result in exc.best",
+            result,
+        )
+    return result
+
+
+def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: float) -> tuple[Array, Array]:
+    """Value and error of one step for all elements."""
+    term, part = step.term, step.part
+    if step.method is Method.ZERO:
+        return np.zeros(len(elements)), np.zeros(len(elements))
+    if isinstance(part, Collimated):
+        step.effort.add(len(elements), 1)
+        return closed_forms.collimated(term, part, elements)
+    if step.method is Method.LAMBERT:
+        return closed_forms.lambertian_cap(term, part, elements)
+    if step.method is Method.MIRROR:
+        return closed_forms.mirror_cap(term, part, elements)
+    if step.method is Method.RADIAL:
+        slopes, where = np.unique(theta_n, return_inverse=True)
+        if len(slopes) > _FEW:
+            table = radial.tabulate(
+                lambda t: integrate_cap(
+                    term, part, Elements.from_polar(t, 0.0), rtol=0.25 * rtol, atol=0.25 * atol, about_normal=None, effort=step.effort
+                ),
+                float(slopes[-1]),
+                rtol=rtol,
+                atol=atol,
+            )
+            return table(theta_n)
+        first = np.zeros(len(slopes), dtype=np.intp)
+        first[where[::-1]] = np.arange(len(theta_n))[::-1]
+        v, e = integrate_cap(term, part, elements.select(first), rtol=rtol, atol=atol, about_normal=None, effort=step.effort)
+        return v[where], e[where]
+    return integrate_cap(term, part, elements, rtol=rtol, atol=atol, about_normal=None, effort=step.effort)
+
+
+def scene_radiance(
+    brdf: BRDF, source: Source, theta_n: ArrayLike, phi_n: ArrayLike, *, form: str = "local", rtol: float = 1e-6
+) -> Estimate:
+    """The general integral of the memo's section 13 by quadrature, in either of its two forms.
+
+    The closed forms are not used: this is the path they are checked against. `reflectance_map` is the way to a result.
+
+    Parameters
+    ----------
+    brdf : BRDF
+        Without delta functions.
+    source : Source
+        Without beams.
+    theta_n, phi_n : array_like, shapes broadcast to (...)
+        Polar angles of the surface normal [rad], 0 <= theta_n < pi/2.
+    form : {"local", "viewer"}
+        Polar coordinates about the surface normal, or about the axis of each part of the source, which for uniform and
+        hemispherical sources is the viewer's.
+    rtol : float, optional
+        Relative error requested.
+
+    Returns
+    -------
+    Estimate
+        [W m^-2 sr^-1], shape (...).
+    """
+    if form not in ("local", "viewer"):
+        raise ParameterError(f"form = {form!r}; the memo has two: 'local' and 'viewer'")
+    theta, phi = np.broadcast_arrays(np.asarray(theta_n, dtype=float), np.asarray(phi_n, dtype=float))
+    if not np.all((theta >= 0) & (theta <= np.pi / 2)):
+        raise GeometryError("theta_n must be within 0 and 90 degrees")
+    elements = Elements.from_polar(theta.ravel(), phi.ravel())
+    value, error = np.zeros(len(elements)), np.zeros(len(elements))
+    for step in plan(brdf, source):
+        if not isinstance(step.part, Cap):
+            raise ParameterError("a collimated beam is a delta function: its integral is closed form 14a, not a quadrature")
+        v, e = integrate_cap(
+            step.term, step.part, elements, rtol=rtol, atol=0.0, about_normal=form == "local", effort=step.effort
+        )
+        value, error = value + v, error + e
+    return Estimate(value.reshape(theta.shape), error.reshape(theta.shape))
+
+
+def directional_albedo(brdf: BRDF, theta_r: ArrayLike, *, rtol: float = 1e-6) -> Estimate:
+    r"""Directional-hemispherical reflectance, by reciprocity also hemispherical-directional.
+
+    Parameters
+    ----------
+    brdf : BRDF
+    theta_r : array_like, shape (...)
+        Polar angle of the fixed direction from the normal [rad], 0 <= theta_r < pi/2.
+    rtol : float, optional
+        Relative error requested.
+
+    Returns
+    -------
+    Estimate
+        rho [1], shape (...).
+
+    Notes
+    -----
+    A surface under a uniform source of radiance 1 shows rho at theta_n = theta_r, so this is one map under another name.
+
+    Examples
+    --------
+    A rough metal without multiple scattering loses light; at alpha = 1 exactly ln 2 of it (f_0 = 1):
+
+    >>> import gonio
+    >>> metal = gonio.brdf.make("ggx", k_s=1.0, alpha=1.0, f_0=1.0)
+    >>> round(float(directional_albedo(metal, 0.0, rtol=1e-12).value), 12) == round(1 - math.log(2), 12)
+    True
+    """
+    theta = np.asarray(theta_r, dtype=float)
+    if not np.all((theta >= 0) & (theta < np.pi / 2)):
+        raise GeometryError("theta_r must be within 0 and 90 degrees, 90 excluded")
+    flat = reflectance_map(brdf, uniform(1.0), np.tan(theta.ravel()), 0.0, rtol=rtol)
+    return Estimate(flat.value.reshape(theta.shape), flat.error.reshape(theta.shape))
+
+
+def gradient_axes(p: Sequence[float], q: Sequence[float], n: int) -> tuple[Array, Array]:
+    """Axes of a square grid of gradients, each of n points from p[0] to p[1] and from q[0] to q[1]."""
+    return np.linspace(p[0], p[1], n), np.linspace(q[0], q[1], n)

@@ -1,0 +1,118 @@
+"""One (term, cap) integral for each of many surface elements, by the rule of `gonio.integrate.cap`, order by order.
+
+The error of a value is its difference from the next lower order, which in the converging regime is the error of that
+lower order and so far above that of the value, plus the rounding of the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf.base import Term, accumulate
+from gonio.errors import IntegrationError
+from gonio.integrate.cap import ORDERS, cap_nodes, unit_rule
+from gonio.integrate.frames import Elements
+from gonio.source import Cap
+
+Array = NDArray[np.float64]
+EPS = float(np.finfo(float).eps)
+_LARGEST = 1 << 24  # nodes for one surface element: 512 MiB
+
+
+@dataclass
+class Effort:
+    """What a calculation cost: BRDF evaluations and the highest order used."""
+
+    evaluations: int = 0
+    order: int = 0
+
+    def add(self, nodes: int, order: int) -> None:
+        self.evaluations += nodes
+        self.order = max(self.order, order)
+
+
+class _Scratch:
+    """Node arrays that grow to what the largest element needs."""
+
+    def __init__(self) -> None:
+        self.resize(1 << 14)
+
+    def resize(self, size: int) -> None:
+        self.directions, self.weights = np.empty((size, 3)), np.empty(size)
+        self.viewer, self.f_r = np.empty((size, 3)), np.empty(size)
+
+
+def integrate_cap(
+    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool | None, effort: Effort
+) -> tuple[Array, Array]:
+    """Reflected radiance of each element due to one term and one cap.
+
+    Parameters
+    ----------
+    term : Term
+        With a function (no delta).
+    cap : Cap
+    elements : Elements, length n
+    rtol, atol : float
+        Tolerance per element. An element that does not reach it keeps its honest error.
+    about_normal : bool or None
+        Pole of the coordinates: the surface normal (the memo's local form) or the cap's axis (its viewer form, when the
+        axis is the viewer's). None: the normal for wide caps, the axis for narrow ones.
+    effort : Effort
+        Added to.
+
+    Returns
+    -------
+    value, error : ndarray, shape (n,)
+        [W m^-2 sr^-1].
+
+    Raises
+    ------
+    IntegrationError
+        If an element would need more than 16 million nodes.
+    """
+    local = about_normal if about_normal is not None else cap.half_angle > 0.5
+    width = term.lobe_width()
+    axis_local = elements.local(cap.axis)
+    value, error = np.zeros(len(elements)), np.zeros(len(elements))
+    scratch = _Scratch()
+    for k in range(len(elements)):
+        axis = np.ascontiguousarray(axis_local[k])
+        if cap.half_angle < np.pi / 2 and axis[2] <= -np.sin(cap.half_angle):
+            continue  # the whole cap is below the horizon of this element
+        symmetric = bool(axis[1] == 0.0) and term.model.isotropic
+        frame = (float(elements.cos_theta[k]), float(elements.sin_theta[k]), axis, cap.half_angle, local, width or 1e9, symmetric)
+        if term.model.diffuse:  # one constant: look no closer than the cap needs
+            frame = (*frame[:5], 1e9, symmetric)
+        before = np.nan
+        for order in ORDERS:
+            total, magnitude, nodes = _sum(term, cap, frame, order, scratch)
+            effort.add(nodes, order)
+            difference = abs(total - before)
+            before = total
+            rounding = 4.0 * EPS * magnitude * (1.0 + 1.0 / (width or 1.0))
+            if difference <= max(rtol * abs(total), atol) - rounding:
+                break
+        value[k], error[k] = total, difference + rounding
+    return value, error
+
+
+def _sum(term: Term, cap: Cap, frame: tuple[object, ...], order: int, scratch: _Scratch) -> tuple[float, float, int]:
+    x, w = unit_rule(order)
+    while (n := cap_nodes(*frame, x, w, scratch.directions, scratch.weights)) < 0:
+        if scratch.weights.size >= _LARGEST:
+            raise IntegrationError(f"{term.model.name} under {cap.kind}: more than {_LARGEST} nodes for one gradient")
+        scratch.resize(2 * scratch.weights.size)
+    directions, weights = scratch.directions[:n], scratch.weights[:n]
+    viewer, f_r = scratch.viewer[:n], scratch.f_r[:n]
+    cos_n, sin_n, axis = frame[0], frame[1], frame[2]
+    viewer[:] = (-sin_n, 0.0, cos_n)  # type: ignore[operator]
+    f_r[:] = 0.0
+    accumulate(term.model)(directions, viewer, term.values, term.weight, f_r)
+    if cap.profile is not None:
+        f_r *= cap.profile(directions @ np.asarray(axis))
+    total = cap.radiance * float(np.dot(weights, f_r))
+    return total, abs(total), n

@@ -1,0 +1,230 @@
+r"""Light sources: distant, in viewer-oriented coordinates (z towards the viewer).
+
+A source is a sum of parts. A part is either a collimated beam, a delta function in direction, or a radiance over a cap of
+directions around an axis: a disk, a hemisphere, the whole sphere. That one shape is all the integrator has to know.
+
+References
+----------
+.. [1] B. K. P. Horn, R. W. Sjoberg, MIT AI Memo 498, 1978, sections 7 and 14.
+.. [2] P. Moon, D. E. Spencer, "Illumination from a non-uniform sky", Illum. Eng. 37, 1942; CIE S 003/E-1996 (overcast sky).
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gonio.errors import GeometryError, ParameterError
+from gonio.geometry import unit_vector
+
+Array = NDArray[np.float64]
+ViewAxis = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Collimated:
+    """A beam from one direction.
+
+    Attributes
+    ----------
+    direction : tuple of float, length 3
+        Unit vector towards the source.
+    irradiance : float
+        On a plane normal to the beam, E_0 [W m^-2].
+    """
+
+    direction: tuple[float, float, float]
+    irradiance: float
+
+
+@dataclass(frozen=True)
+class Cap:
+    """Radiance over all directions within a half angle of an axis.
+
+    Attributes
+    ----------
+    kind : str
+    axis : tuple of float, length 3
+        Unit vector.
+    half_angle : float
+        [rad]; pi is the whole sphere.
+    radiance : float
+        Scale of the radiance [W m^-2 sr^-1].
+    profile : callable, optional
+        Relative radiance of w . axis, shape (n,) -> (n,); None for a uniform cap.
+    """
+
+    kind: str
+    axis: tuple[float, float, float]
+    half_angle: float
+    radiance: float
+    profile: Callable[[Array], Array] | None = None
+
+    def at(self, directions: Array) -> Array:
+        """Radiance from directions (n, 3), 0 outside the cap."""
+        along = directions @ np.array(self.axis)
+        relative = np.ones_like(along) if self.profile is None else self.profile(along)
+        if self.half_angle >= math.pi:
+            return self.radiance * relative
+        return np.where(along > math.cos(self.half_angle), self.radiance * relative, 0.0)
+
+
+class Source:
+    """A sum of collimated beams and caps.
+
+    Examples
+    --------
+    >>> sky = make("hemispherical", radiance=1.0)
+    >>> float((sky + sky).radiance([0.0, 0.0, 1.0]))
+    2.0
+    """
+
+    def __init__(self, parts: Iterable[Collimated | Cap]) -> None:
+        self.parts = tuple(parts)
+        if not self.parts:
+            raise ParameterError("a source needs at least one part")
+
+    def __add__(self, other: Source) -> Source:
+        if not isinstance(other, Source):
+            return NotImplemented
+        return Source(self.parts + other.parts)
+
+    def __repr__(self) -> str:
+        return " + ".join(part.kind if isinstance(part, Cap) else "collimated" for part in self.parts)
+
+    def radiance(self, direction: ArrayLike) -> Array:
+        """Radiance arriving from directions; beams are delta functions and do not count.
+
+        Parameters
+        ----------
+        direction : array_like, shape (..., 3)
+            Unit vectors towards the source, viewer-oriented.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            L_i [W m^-2 sr^-1].
+        """
+        w = np.asarray(direction, dtype=float)
+        total = np.zeros(w.reshape(-1, 3).shape[0])
+        for part in self.parts:
+            if isinstance(part, Cap):
+                total += part.at(w.reshape(-1, 3))
+        return total.reshape(w.shape[:-1])
+
+
+def collimated(theta: float, phi: float, irradiance: float = 1.0) -> Source:
+    """A distant point source (memo, sections 7 and 14a).
+
+    Parameters
+    ----------
+    theta, phi : float
+        Direction towards the source [rad], viewer-oriented, 0 <= theta <= pi.
+    irradiance : float
+        E_0 on a plane normal to the beam [W m^-2].
+    """
+    return Source([Collimated(_direction(theta, phi), _amount("irradiance", irradiance))])
+
+
+def uniform(radiance: float = 1.0) -> Source:
+    """The same radiance from all directions of the sphere (memo, section 14b)."""
+    return Source([Cap("uniform", ViewAxis, math.pi, _amount("radiance", radiance))])
+
+
+def hemispherical(radiance: float = 1.0, axis: Sequence[float] = ViewAxis) -> Source:
+    """The same radiance from all directions of a hemisphere (memo, section 14c, with the axis towards the viewer)."""
+    return Source([Cap("hemispherical", _axis(axis), math.pi / 2, _amount("radiance", radiance))])
+
+
+def disk(
+    theta: float, phi: float, half_angle: float, radiance: float | None = None, irradiance: float | None = None
+) -> Source:
+    """A uniform disk such as the sun.
+
+    Parameters
+    ----------
+    theta, phi : float
+        Direction of the centre [rad].
+    half_angle : float
+        [rad], 0 < half_angle <= pi/2.
+    radiance, irradiance : float
+        One of the two: L_i, or the irradiance on the plane normal to the axis, pi L_i sin^2(half_angle).
+    """
+    if not (math.isfinite(half_angle) and 0 < half_angle <= math.pi / 2):
+        raise ParameterError(f"disk: half_angle = {math.degrees(half_angle):g} degrees; choose 0 < half_angle <= 90 degrees")
+    if (radiance is None) == (irradiance is None):
+        raise ParameterError("disk: give either radiance or irradiance")
+    if radiance is None:
+        radiance = _amount("irradiance", irradiance or 0.0) / (math.pi * math.sin(half_angle) ** 2)
+    return Source([Cap("disk", _direction(theta, phi), half_angle, _amount("radiance", radiance))])
+
+
+def overcast(zenith_radiance: float = 1.0, axis: Sequence[float] = ViewAxis) -> Source:
+    """CIE standard overcast sky [2]_: L = L_z (1 + 2 u.w) / 3 above its horizon."""
+    return Source([Cap("overcast", _axis(axis), math.pi / 2, _amount("zenith_radiance", zenith_radiance), _overcast)])
+
+
+def _overcast(along: Array) -> Array:
+    return (1.0 + 2.0 * along) / 3.0
+
+
+_KINDS: dict[str, Callable[..., Source]] = {
+    f.__name__: f for f in (collimated, uniform, hemispherical, disk, overcast)
+}
+
+
+def kinds() -> dict[str, Callable[..., Source]]:
+    """All source kinds by name."""
+    return dict(_KINDS)
+
+
+def make(kind: str, **parameters: object) -> Source:
+    """A source by name; see the function of that name for its parameters.
+
+    Raises
+    ------
+    ParameterError
+        If the kind or a parameter is unknown, missing or outside its range.
+    """
+    if kind not in _KINDS:
+        near = difflib.get_close_matches(kind, list(_KINDS), 1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ParameterError(f"there is no source kind {kind!r}{hint}; known are: {', '.join(sorted(_KINDS))}")
+    signature = inspect.signature(_KINDS[kind])
+    unknown = [name for name in parameters if name not in signature.parameters]
+    if unknown:
+        raise ParameterError(f"{kind} has no parameter {unknown[0]!r}; it has: {', '.join(signature.parameters)}")
+    missing = [n for n, p in signature.parameters.items() if p.default is inspect.Parameter.empty and n not in parameters]
+    if missing:
+        raise ParameterError(f"{kind} needs {', '.join(missing)} as well")
+    return _KINDS[kind](**parameters)
+
+
+def _direction(theta: float, phi: float) -> tuple[float, float, float]:
+    if not (math.isfinite(theta) and math.isfinite(phi) and 0 <= theta <= math.pi):
+        raise GeometryError(
+            f"source at theta = {math.degrees(theta):g}, phi = {math.degrees(phi):g} degrees; "
+            "choose 0 <= theta <= 180 degrees and a finite phi"
+        )
+    x, y, z = unit_vector(theta, phi)
+    return float(x), float(y), float(z)
+
+
+def _axis(axis: Sequence[float]) -> tuple[float, float, float]:
+    vector = np.asarray(axis, dtype=float)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)) or not np.any(vector):
+        raise GeometryError(f"axis = {list(axis)} is no direction; give three finite numbers, not all zero")
+    x, y, z = vector / np.linalg.norm(vector)
+    return float(x), float(y), float(z)
+
+
+def _amount(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value >= 0):
+        raise ParameterError(f"{name} = {value:g} is not possible; give a finite number >= 0")
+    return float(value)
