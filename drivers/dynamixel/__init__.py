@@ -1,0 +1,6 @@
+"""Dynamixel X-series servos on Protocol 2.0."""
+
+from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.servo import Servo
+
+__all__ = ["Bus", "Servo"]

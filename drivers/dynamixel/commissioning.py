@@ -1,0 +1,127 @@
+"""Bringing a servo into service: is it the right one, is it healthy, does it hold the axis's settings?
+
+What is already right is not written again. EEPROM takes a write only while torque is off, so torque goes off, for a
+moment and with a warning in the log, if and only if a setting there has to change. It moves nothing and leaves torque
+as it found it, or off.
+
+References: ROBOTIS e-manual, XM430-W350, sections on Drive Mode, Operating Mode and Position Limits
+(emanual.robotis.com/docs/en/dxl/x/xm430-w350).
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from drivers.dynamixel import registers as reg
+from drivers.dynamixel.bus import Bus
+from gonio.errors import DeviceError, HardwareStatusError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a servo is to hold, in its own units.
+
+    Attributes
+    ----------
+    model : ServoModel
+        That it must be.
+    low, high : int
+        Position limits [counts].
+    profile_velocity, profile_acceleration : int
+        Registers 112 and 108; 0 would mean unlimited.
+    """
+
+    model: reg.ServoModel
+    low: int
+    high: int
+    profile_velocity: int
+    profile_acceleration: int
+
+
+def commission(bus: Bus, servo_id: int, settings: Settings) -> dict[str, object]:
+    """Check the servo, give it the settings, and return its identity (JSON-compatible).
+
+    Raises
+    ------
+    DeviceError
+        With the first thing that is wrong.
+    """
+    identity = _identify(bus, servo_id, settings.model)
+    identity |= _check_health(bus, servo_id)
+    _write_eeprom(bus, servo_id, settings)
+    if bus.read(servo_id, reg.BUS_WATCHDOG) != 0:  # tripped, or left armed by a process that died
+        bus.write(servo_id, reg.BUS_WATCHDOG, 0)
+    profile = {
+        reg.PROFILE_ACCELERATION: settings.profile_acceleration,
+        reg.PROFILE_VELOCITY: settings.profile_velocity,
+    }
+    _write_checked(bus, servo_id, profile, "lower the axis's velocity")
+    for register in (reg.HOMING_OFFSET, reg.POSITION_P_GAIN, reg.POSITION_I_GAIN, reg.POSITION_D_GAIN):
+        identity[register.name.lower().replace(" ", "_")] = bus.read(servo_id, register)
+    return identity
+
+
+def _identify(bus: Bus, servo_id: int, model: reg.ServoModel) -> dict[str, object]:
+    number, firmware = bus.ping(servo_id)
+    if number != model.number:
+        found = next((m.name for m in reg.MODELS.values() if m.number == number), "a model unknown to gonio")
+        raise DeviceError(
+            f"{bus.label(servo_id)} is model number {number} ({found}), rig.toml says {model.name} ({model.number}); "
+            "correct the model or the id."
+        )
+    # A servo set to answer only pings or reads is told to answer everything; a retry then gets its answer.
+    bus.write(servo_id, reg.STATUS_RETURN_LEVEL, 2)
+    protocol = bus.read(servo_id, reg.PROTOCOL_TYPE)
+    if protocol != 2:
+        raise DeviceError(
+            f"{bus.label(servo_id)} has Protocol Type {protocol}, gonio needs 2; set it with the maker's tool."
+        )
+    return {"model": model.name, "model_number": number, "firmware": firmware, "id": servo_id}
+
+
+def _check_health(bus: Bus, servo_id: int) -> dict[str, object]:
+    if bus.read(servo_id, reg.HARDWARE_ERROR_STATUS):
+        raise bus.hardware_fault(servo_id)
+    volts = bus.read(servo_id, reg.PRESENT_VOLTAGE) * reg.VOLTAGE_UNIT_V
+    low = bus.read(servo_id, reg.MIN_VOLTAGE_LIMIT) * reg.VOLTAGE_UNIT_V
+    high = bus.read(servo_id, reg.MAX_VOLTAGE_LIMIT) * reg.VOLTAGE_UNIT_V
+    if not low <= volts <= high:
+        raise HardwareStatusError(
+            f"{bus.label(servo_id)} has a supply of {volts:.1f} V, its range is {low:.1f} to {high:.1f} V; "
+            "check the power supply."
+        )
+    return {"voltage_v": round(volts, 1)}
+
+
+def _write_eeprom(bus: Bus, servo_id: int, settings: Settings) -> None:
+    # `direction` in rig.toml reverses; a time-based profile would take our velocity for milliseconds; torque that
+    # comes on with a goal would undo the order in which it is switched on.
+    unwanted = reg.DRIVE_REVERSE | reg.DRIVE_TIME_BASED | reg.DRIVE_TORQUE_BY_GOAL
+    wanted = {
+        reg.RETURN_DELAY_TIME: 0,
+        reg.DRIVE_MODE: bus.read(servo_id, reg.DRIVE_MODE) & ~unwanted,
+        reg.OPERATING_MODE: reg.POSITION_MODE,  # the mode in which the servo itself keeps to its limits
+        reg.MAX_POSITION_LIMIT: settings.high,
+        reg.MIN_POSITION_LIMIT: settings.low,
+    }
+    changes = {register: value for register, value in wanted.items() if bus.read(servo_id, register) != value}
+    if not changes:
+        return
+    if bus.read(servo_id, reg.TORQUE_ENABLE):
+        names = ", ".join(register.name for register in changes)
+        logger.warning("%s: torque off for a moment to change %s", bus.label(servo_id), names)
+        bus.write(servo_id, reg.TORQUE_ENABLE, 0)
+    _write_checked(bus, servo_id, changes, "power-cycle it and retry")
+
+
+def _write_checked(bus: Bus, servo_id: int, values: dict[reg.Register, int], remedy: str) -> None:
+    for register, value in values.items():
+        bus.write(servo_id, register, value)
+        found = bus.read(servo_id, register)
+        if found != value:
+            raise DeviceError(
+                f"{bus.label(servo_id)} keeps {register.name} = {found}, {value} was written; {remedy}."
+            )

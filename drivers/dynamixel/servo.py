@@ -1,0 +1,446 @@
+"""One X-series servo as an axis: joint angles in, measured joint angles out.
+
+It puts the servo in position mode with the axis's limits in its own EEPROM, approaches every goal from one side so that
+the gears' play falls the same way each time, and calls a move finished only when the servo stands still at its goal by
+every sign it gives. The goal is never reported as an angle. It never waits: `settled` is polled, and drives the second
+leg of an approach. It does not know the rig's geometry, nor where the axis's true zero is, and it never takes torque off
+a loaded arm, except at `connect`, once, when a setting in EEPROM has to change.
+
+Angles [rad] and counts: ``counts = zero_counts + direction * angle * 4096 / (2 pi)``.
+
+References: ROBOTIS e-manual, XM430-W350 (emanual.robotis.com/docs/en/dxl/x/xm430-w350).
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Literal
+
+from drivers.dynamixel import registers as reg
+from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.commissioning import Settings, commission
+from drivers.dynamixel.leg import Leg, Outcome
+from gonio.errors import ConfigurationError, DeviceError, LimitError, ProtocolError
+from gonio.interfaces import AxisLimits, AxisReading
+
+logger = logging.getLogger(__name__)
+
+_COUNTS_PER_RAD = reg.COUNTS_PER_TURN / (2.0 * math.pi)
+_ANGLE_SLACK = 1e-9  # rad; an angle computed from the limit in degrees is not beyond it
+_RESENDS = 2
+
+
+class Servo:
+    """An axis driven by an X-series servo; satisfies `gonio.interfaces.Axis`.
+
+    Parameters
+    ----------
+    bus : Bus
+        Open line.
+    name : str
+        Of the axis, as messages call it.
+    servo_id : int
+        On the line, 0 to 252.
+    model : str, optional
+        As on the label.
+    zero_counts : int, optional
+        Present Position at angle 0.
+    direction : {1, -1}, optional
+        Sign of counts against angle.
+    lower, upper : float
+        Joint limits [rad]; they must lie within the servo's turn, counts 0 to 4095.
+    velocity, acceleration : float
+        Of the motion profile [rad/s, rad/s^2]; the servo gets the next lower step (0.024, 0.37).
+    approach : {"up", "down", "any"}, optional
+        Side of the final approach: with increasing angle, decreasing, or as it comes.
+    overshoot : float, optional
+        How far before the goal the final approach begins [rad]; at least 1 degree and more than the tolerance.
+    tolerance_counts : int, optional
+        Friction lets a servo stop this far from its goal; farther is a stall.
+    settle_s : float, optional
+        Two equal readings this far apart in rig time mean that the axis stands [s].
+    stall_s : float, optional
+        Without progress for so long in rig time, the move has failed [s].
+    watchdog_s : float, optional
+        The servo stops by itself if it hears nothing for so long during a move [s], at most 2.54; None for never.
+
+    Raises
+    ------
+    ConfigurationError
+        If a parameter is outside its range.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        servo_id: int,
+        *,
+        model: str = "XM430-W350",
+        zero_counts: int = 2048,
+        direction: int = 1,
+        lower: float,
+        upper: float,
+        velocity: float,
+        acceleration: float,
+        approach: Literal["up", "down", "any"] = "up",
+        overshoot: float = math.radians(2.0),
+        tolerance_counts: int = 12,
+        settle_s: float = 0.05,
+        stall_s: float = 2.0,
+        watchdog_s: float | None = None,
+    ) -> None:
+        self._bus = bus
+        self._name = name
+        self._id = servo_id
+        self._zero = zero_counts
+        self._direction = direction
+        self._limits = AxisLimits(lower, upper, velocity)
+        self._approach = approach
+        self._overshoot_counts = round(overshoot * _COUNTS_PER_RAD)
+        self._tolerance = tolerance_counts
+        self._settle_s = settle_s
+        self._stall_s = stall_s
+        self._check_parameters(model, acceleration, overshoot, watchdog_s)
+        self._watchdog = 0 if watchdog_s is None else max(1, round(watchdog_s / reg.WATCHDOG_UNIT_S))
+        self._low_counts, self._high_counts = sorted((self._counts(lower), self._counts(upper)))
+        if self._low_counts < 0 or self._high_counts > reg.COUNTS_PER_TURN - 1:
+            raise ConfigurationError(
+                f"Axis {name}: limits {math.degrees(lower):g} to {math.degrees(upper):g} deg are counts "
+                f"{self._low_counts} to {self._high_counts}, the servo has 0 to {reg.COUNTS_PER_TURN - 1}; "
+                "narrow the limits or mount the horn so that zero_counts is near 2048."
+            )
+        self._settings = Settings(
+            reg.MODELS[model],
+            self._low_counts,
+            self._high_counts,
+            max(1, int(velocity / reg.VELOCITY_UNIT)),
+            max(1, int(acceleration / reg.ACCELERATION_UNIT)),
+        )
+        self._connected = False
+        self._identity: dict[str, object] = {}
+        self._goal: int | None = None  # of the move [counts]; None when the axis only holds
+        self._legs: list[int] = []  # goals still to come, the current one first [counts]
+        self._leg: Leg | None = None  # the current one
+        self._arrived = False
+        self._one_sided = False  # this move ends from the approach side
+        self._engaged = False  # the last move did, so the play lies there
+        self._resends = 0
+        bus.register(servo_id, self)
+
+    def _check_parameters(self, model: str, acceleration: float, overshoot: float, watchdog_s: float | None) -> None:
+        def refuse(text: str) -> ConfigurationError:
+            return ConfigurationError(f"Axis {self._name}: {text}")
+
+        if not 0 <= self._id <= 252:
+            raise refuse(f"id {self._id} is outside 0 to 252.")
+        if model not in reg.MODELS:
+            raise refuse(f"model {model!r} is not known; one of {', '.join(reg.MODELS)}.")
+        if self._direction not in (1, -1):
+            raise refuse(f"direction {self._direction} must be 1 or -1.")
+        if self._approach not in ("up", "down", "any"):
+            raise refuse(f"approach {self._approach!r} must be up, down or any.")
+        if not self._limits.lower < self._limits.upper:
+            raise refuse(
+                f"lower limit {math.degrees(self._limits.lower):g} deg is not below "
+                f"upper limit {math.degrees(self._limits.upper):g} deg."
+            )
+        if not self._limits.velocity > 0.0 or not acceleration > 0.0:
+            raise refuse(
+                f"velocity {math.degrees(self._limits.velocity):g} deg/s and acceleration "
+                f"{math.degrees(acceleration):g} deg/s^2 must be above 0 (0 would mean unlimited to the servo)."
+            )
+        if self._approach != "any" and not (
+            overshoot >= math.radians(1.0) - _ANGLE_SLACK and self._overshoot_counts > self._tolerance
+        ):
+            raise refuse(
+                f"overshoot {math.degrees(overshoot):g} deg ({self._overshoot_counts} counts) must be at least 1 deg and "
+                f"more than the tolerance of {self._tolerance} counts, or the approach would not come from one side."
+            )
+        if not self._tolerance >= 0 or not self._settle_s > 0.0 or not self._stall_s > self._settle_s:
+            raise refuse("tolerance_counts must be 0 or more, and stall_s longer than settle_s, which is above 0.")
+        if watchdog_s is not None and not 0.0 < watchdog_s <= 127 * reg.WATCHDOG_UNIT_S:
+            raise refuse(f"watchdog {watchdog_s:g} s is outside 0 to 2.54 s.")
+
+    # -- connection
+
+    def connect(self) -> None:
+        """Check that the right, healthy servo answers, put the axis's settings into it, torque on without a jump.
+
+        Raises
+        ------
+        DeviceError
+            With the first thing that is wrong.
+        """
+        self._identity = commission(self._bus, self._id, self._settings)
+        self._torque_on()
+        self._connected = True
+        logger.info("axis %s connected: %s", self._name, self._identity)
+
+    def _torque_on(self) -> None:
+        present = self._bus.agreed_block(self._id)
+        holds = bool(self._read(reg.TORQUE_ENABLE))
+        goal = self.clip(present.position)
+        if abs(goal - present.position) > self._tolerance:
+            raise LimitError(
+                f"{self._label} stands at {self._degrees(present.position):.2f} deg, outside its limits of "
+                f"{self._limits_text}; {'switch its torque off and ' if holds else ''}turn it into them by hand, "
+                "or correct the limits."
+            )
+        if holds and not present.in_motion:
+            goal = present.goal  # a new one would only move it
+        if present.goal != goal:
+            self._write(reg.GOAL_POSITION, goal)
+        if not holds:
+            self._write(reg.TORQUE_ENABLE, 1)
+            if not self._read(reg.TORQUE_ENABLE):
+                raise DeviceError(f"{self._label} does not switch its torque on; power-cycle it and retry.")
+        self.halted(self._bus.block(self._id).goal)
+
+    # -- Axis
+
+    @property
+    def name(self) -> str:
+        """Of the axis."""
+        return self._name
+
+    @property
+    def limits(self) -> AxisLimits:
+        """Host-side limits; the servo holds the same."""
+        return self._limits
+
+    def move_to(self, angle: float) -> None:
+        """Start moving to `angle` [rad]; returns at once.
+
+        Raises
+        ------
+        LimitError
+            Outside the limits; nothing was sent.
+        """
+        low, high = self._limits.lower, self._limits.upper
+        if not low - _ANGLE_SLACK <= angle <= high + _ANGLE_SLACK:
+            raise LimitError(
+                f"Axis {self._name} was asked for {math.degrees(angle):.3f} deg, its limits are {self._limits_text}; "
+                "nothing was sent: change the plan or the limits in rig.toml."
+            )
+        self._need_connection()
+        goal = self._counts(angle)
+        if goal == self._goal:  # under way, or there
+            return
+        legs = self._plan(goal, self._healthy(self._bus.block(self._id)))
+        if self._watchdog:
+            self._write(reg.BUS_WATCHDOG, 0)
+            self._write(reg.BUS_WATCHDOG, self._watchdog)
+        self._begin(legs)
+        self._write(reg.GOAL_POSITION, legs[0])
+
+    def _plan(self, goal: int, present: reg.Block) -> list[int]:
+        """Goals of the legs [counts]: one, or two if the direct way comes from the wrong side."""
+        self._one_sided = True
+        if self._approach == "any":
+            return [goal]
+        side = self._direction if self._approach == "up" else -self._direction  # sign of the final approach [counts]
+        travel = side * (goal - present.position)
+        if travel >= self._overshoot_counts or (travel >= 0 and self._engaged and self._arrived):
+            return [goal]
+        before = self.clip(goal - side * self._overshoot_counts)
+        if side * (goal - before) > self._tolerance:
+            return [before, goal]
+        self._one_sided = False
+        logger.warning(
+            "axis %s: %.2f deg is so near to a limit that the final approach cannot come from one side",
+            self._name, self._degrees(goal),
+        )  # fmt: skip
+        return [before, goal] if before != goal else [goal]
+
+    def _begin(self, legs: list[int]) -> None:
+        self._legs = legs
+        self._goal = legs[-1]
+        self._arrived = False
+        self._resends = 0
+        self._start_leg()
+
+    def _start_leg(self) -> None:
+        self._leg = Leg(self._legs[0], self._tolerance, self._settle_s, self._stall_s, self._bus.clock.now())
+
+    def settled(self) -> bool:
+        """Poll: True once the axis stands at its goal by every sign it can give.
+
+        Signs: the servo holds the goal that was sent, it does not move and runs no profile, it is within the tolerance
+        of the goal, and two readings `settle_s` apart are equal.
+
+        Raises
+        ------
+        DeviceError
+            Hardware error, stall, lost torque, no answer.
+        """
+        self._need_connection()
+        block = self._healthy(self._bus.block(self._id))
+        if block.goal != self._legs[0]:
+            self._resend(block)
+            return False
+        assert self._leg is not None  # connected
+        if self._arrived:
+            if self._leg.still(block):
+                return True
+            self._arrived = False  # pushed away
+            self._start_leg()
+        outcome = self._leg.see(block)
+        if outcome is Outcome.STALLED:
+            self._give_up(block)
+        return outcome is Outcome.AT_REST and self._finish_leg()
+
+    def _finish_leg(self) -> bool:
+        """The current leg has ended: start the next, or arrive."""
+        if len(self._legs) > 1:
+            del self._legs[0]
+            self._start_leg()
+            self._write(reg.GOAL_POSITION, self._legs[0])
+            return False
+        self._arrived = True
+        self._engaged = self._one_sided
+        if self._watchdog:
+            self._write(reg.BUS_WATCHDOG, 0)
+        return True
+
+    def _resend(self, block: reg.Block) -> None:
+        """The servo holds another goal than the one it acknowledged."""
+        if not self._read(reg.TORQUE_ENABLE):
+            raise DeviceError(
+                f"{self._label} has lost its torque, as after a dip of its supply, at "
+                f"{self._degrees(block.position):.2f} deg; check power and cable, then connect again."
+            )
+        if self._resends >= _RESENDS:
+            raise ProtocolError(
+                f"{self._label} holds goal {block.goal} counts where {self._legs[0]} was sent {1 + _RESENDS} times; "
+                "check that no other program moves it."
+            )
+        self._resends += 1
+        logger.warning("axis %s: goal %d instead of %d, sent again", self._name, block.goal, self._legs[0])
+        self._write(reg.GOAL_POSITION, self._legs[0])
+
+    def _give_up(self, block: reg.Block) -> None:
+        """No progress: let go of the load, say what was seen."""
+        goal = self._legs[0]
+        tripped = bool(self._watchdog) and self._read(reg.BUS_WATCHDOG) == -1
+        current = self._current_a(block)
+        try:
+            self.stop()
+        except DeviceError as error:
+            logger.warning("axis %s: cannot be stopped after its stall: %s", self._name, error)
+        if tripped:
+            raise DeviceError(
+                f"{self._label} was stopped by its own watchdog at {self._degrees(block.position):.2f} deg on the way to "
+                f"{self._degrees(goal):.2f} deg: the computer was silent too long; raise watchdog_s and resume."
+            )
+        load = "" if math.isnan(current) else f" with {current:.2f} A"
+        raise DeviceError(
+            f"{self._label} makes no progress for {self._stall_s:g} s: it stands at {self._degrees(block.position):.2f} deg"
+            f"{load}, its goal is {self._degrees(goal):.2f} deg; look for an obstacle, too heavy a load or a low supply."
+        )
+
+    def read(self) -> AxisReading:
+        """Measure now: two consecutive consistent blocks.
+
+        Raises
+        ------
+        HardwareStatusError
+            The servo reports an error of its own.
+        """
+        self._need_connection()
+        block = self._healthy(self._bus.agreed_block(self._id))
+        return AxisReading(
+            angle=self._angle(block.position),
+            position_counts=block.position,
+            goal_counts=block.goal,
+            velocity=self._direction * block.velocity * reg.VELOCITY_UNIT,
+            moving=block.in_motion,
+            temperature_c=float(block.temperature),
+            voltage_v=block.voltage * reg.VOLTAGE_UNIT_V,
+            current_a=self._current_a(block),
+        )
+
+    def stop(self) -> None:
+        """Stop now and hold: goal := present, torque stays on."""
+        self._need_connection()
+        goal = self.clip(self._bus.block(self._id).position)
+        self.halted(goal)
+        self._bus.write(self._id, reg.GOAL_POSITION, goal)
+
+    def describe(self) -> dict[str, object]:
+        """Identity and settings for the run's metadata (JSON-compatible)."""
+        return {
+            "name": self._name,
+            **self._identity,
+            "zero_counts": self._zero,
+            "direction": self._direction,
+            "lower_deg": math.degrees(self._limits.lower),
+            "upper_deg": math.degrees(self._limits.upper),
+            "velocity_deg_s": math.degrees(self._settings.profile_velocity * reg.VELOCITY_UNIT),
+            "acceleration_deg_s2": math.degrees(self._settings.profile_acceleration * reg.ACCELERATION_UNIT),
+            "approach": self._approach,
+            "overshoot_counts": self._overshoot_counts,
+            "tolerance_counts": self._tolerance,
+            "settle_s": self._settle_s,
+            "watchdog_s": self._watchdog * reg.WATCHDOG_UNIT_S,
+        }
+
+    def close(self) -> None:
+        """Let go of the servo; it keeps its torque and holds."""
+        if self._connected and self._watchdog:
+            self._write(reg.BUS_WATCHDOG, 0)
+        self._connected = False
+
+    # -- drivers.dynamixel.bus.Member
+
+    def clip(self, counts: int) -> int:
+        """Nearest position within the limits [counts]."""
+        return min(max(counts, self._low_counts), self._high_counts)
+
+    def halted(self, goal: int) -> None:
+        """The servo was told to hold `goal` [counts]; the move is off."""
+        self._one_sided = self._engaged = False
+        self._begin([goal])
+        self._goal = None
+
+    # -- conversions
+
+    def _counts(self, angle: float) -> int:
+        return self._zero + self._direction * round(angle * _COUNTS_PER_RAD)
+
+    def _angle(self, counts: int) -> float:
+        return self._direction * (counts - self._zero) / _COUNTS_PER_RAD
+
+    def _degrees(self, counts: int) -> float:
+        return math.degrees(self._angle(counts))
+
+    def _current_a(self, block: reg.Block) -> float:
+        unit = self._settings.model.current_unit_a
+        return math.nan if unit is None else block.current * unit
+
+    @property
+    def _label(self) -> str:
+        return self._bus.label(self._id)
+
+    @property
+    def _limits_text(self) -> str:
+        return f"{math.degrees(self._limits.lower):g} to {math.degrees(self._limits.upper):g} deg"
+
+    # -- access
+
+    def _read(self, register: reg.Register) -> int:
+        return self._bus.read(self._id, register)
+
+    def _write(self, register: reg.Register, value: int) -> None:
+        if self._bus.write(self._id, register, value):
+            raise self._bus.hardware_fault(self._id)
+
+    def _healthy(self, block: reg.Block) -> reg.Block:
+        if block.alert:
+            raise self._bus.hardware_fault(self._id)
+        return block
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise DeviceError(f"Axis {self._name} is not connected; call connect() first.")
