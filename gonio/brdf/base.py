@@ -57,7 +57,8 @@ class Parameter:
         number = float(value)
         if not (math.isfinite(number) and self.lower <= number <= self.upper):
             raise ParameterError(
-                f"{owner}: {self.name} = {number:g} is outside [{self.lower:g}, {self.upper:g}] {self.unit}; choose one inside"
+                f"{owner}: {self.name} = {number:g} is outside [{self.lower:g}, {self.upper:g}] {self.unit}; "
+                "choose one inside"
             )
         return number
 
@@ -102,9 +103,7 @@ class Model:
                 )
         missing = [name for name in names if name not in given]
         if missing:
-            raise ParameterError(
-                f"{self.name} needs {', '.join(missing)} as well; its parameters are: {', '.join(names)}"
-            )
+            raise ParameterError(f"{self.name} needs {', '.join(missing)} as well; its parameters are: {', '.join(names)}")
         return np.array([parameter.check(given[parameter.name], self.name) for parameter in self.parameters])
 
 

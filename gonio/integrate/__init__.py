@@ -146,7 +146,13 @@ def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: floa
         if len(slopes) > _FEW:
             table = radial.tabulate(
                 lambda t: integrate_cap(
-                    term, part, Elements.from_polar(t, 0.0), rtol=0.25 * rtol, atol=0.25 * atol, about_normal=None, effort=step.effort
+                    term,
+                    part,
+                    Elements.from_polar(t, 0.0),
+                    rtol=0.25 * rtol,
+                    atol=0.25 * atol,
+                    about_normal=None,
+                    effort=step.effort,
                 ),
                 float(slopes[-1]),
                 rtol=rtol,
@@ -237,8 +243,3 @@ def directional_albedo(brdf: BRDF, theta_r: ArrayLike, *, rtol: float = 1e-6) ->
         raise GeometryError("theta_r must be within 0 and 90 degrees, 90 excluded")
     flat = reflectance_map(brdf, uniform(1.0), np.tan(theta.ravel()), 0.0, rtol=rtol)
     return Estimate(flat.value.reshape(theta.shape), flat.error.reshape(theta.shape))
-
-
-def gradient_axes(p: Sequence[float], q: Sequence[float], n: int) -> tuple[Array, Array]:
-    """Axes of a square grid of gradients, each of n points from p[0] to p[1] and from q[0] to q[1]."""
-    return np.linspace(p[0], p[1], n), np.linspace(q[0], q[1], n)

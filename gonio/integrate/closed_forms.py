@@ -33,7 +33,9 @@ def collimated(term: Term, beam: Collimated, elements: Elements) -> tuple[Array,
     """14a for any BRDF without a delta function; arrays of shape (n,)."""
     omega_i = elements.local(beam.direction)
     out = np.zeros(len(elements))
-    accumulate(term.model)(np.ascontiguousarray(omega_i), np.ascontiguousarray(elements.viewer()), term.values, term.weight, out)
+    accumulate(term.model)(
+        np.ascontiguousarray(omega_i), np.ascontiguousarray(elements.viewer()), term.values, term.weight, out
+    )
     value = beam.irradiance * out * np.maximum(0.0, omega_i[:, 2])
     # cos theta_i is a sum of terms of order 1, good to a few eps; a lobe of width w turns 1 eps of direction into eps/w
     width = term.lobe_width() or 1.0

@@ -84,7 +84,15 @@ def integrate_cap(
         if cap.half_angle < np.pi / 2 and axis[2] <= -np.sin(cap.half_angle):
             continue  # the whole cap is below the horizon of this element
         symmetric = bool(axis[1] == 0.0) and term.model.isotropic
-        frame = (float(elements.cos_theta[k]), float(elements.sin_theta[k]), axis, cap.half_angle, local, width or 1e9, symmetric)
+        frame = (
+            float(elements.cos_theta[k]),
+            float(elements.sin_theta[k]),
+            axis,
+            cap.half_angle,
+            local,
+            width or 1e9,
+            symmetric,
+        )
         if term.model.diffuse:  # one constant: look no closer than the cap needs
             frame = (*frame[:5], 1e9, symmetric)
         before = np.nan
