@@ -71,7 +71,7 @@ def _gather(points, count, centre, width, reach, lower, upper):  # type: ignore[
 
 
 def _cap_nodes(cos_n, sin_n, axis, half_angle, about_normal, width, symmetric, x, w, directions, weights):  # type: ignore[no-untyped-def]
-    """Fill nodes for one surface element; local frame, viewer at (-sin_n, 0, cos_n). Returns how many, -1 if they don't fit."""
+    """Fill nodes for one surface element, local frame, viewer at (-sin_n, 0, cos_n); how many, or -1 if they don't fit."""
     half_pi = 0.5 * math.pi
     # pole e3, centre of the clipping cap c, its half angle, and the reach of t
     if about_normal:

@@ -7,6 +7,7 @@ lower order and so far above that of the value, plus the rounding of the sum.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from gonio.source import Cap
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
+_NO_LOBE = 1e9  # [rad]
 _LARGEST = 1 << 24  # nodes for one surface element: 512 MiB
 
 
@@ -32,6 +34,18 @@ class Effort:
     def add(self, nodes: int, order: int) -> None:
         self.evaluations += nodes
         self.order = max(self.order, order)
+
+
+class _Frame(NamedTuple):
+    """First arguments of `cap_nodes`."""
+
+    cos_n: float
+    sin_n: float
+    axis: Array
+    half_angle: float
+    about_normal: bool
+    width: float
+    symmetric: bool
 
 
 class _Scratch:
@@ -84,17 +98,8 @@ def integrate_cap(
         if cap.half_angle < np.pi / 2 and axis[2] <= -np.sin(cap.half_angle):
             continue  # the whole cap is below the horizon of this element
         symmetric = bool(axis[1] == 0.0) and term.model.isotropic
-        frame = (
-            float(elements.cos_theta[k]),
-            float(elements.sin_theta[k]),
-            axis,
-            cap.half_angle,
-            local,
-            width or 1e9,
-            symmetric,
-        )
-        if term.model.diffuse:  # one constant: look no closer than the cap needs
-            frame = (*frame[:5], 1e9, symmetric)
+        cosine, sine = float(elements.cos_theta[k]), float(elements.sin_theta[k])
+        frame = _Frame(cosine, sine, axis, cap.half_angle, local, width or _NO_LOBE, symmetric)
         before = np.nan
         for order in ORDERS:
             total, magnitude, nodes = _sum(term, cap, frame, order, scratch)
@@ -108,7 +113,7 @@ def integrate_cap(
     return value, error
 
 
-def _sum(term: Term, cap: Cap, frame: tuple[object, ...], order: int, scratch: _Scratch) -> tuple[float, float, int]:
+def _sum(term: Term, cap: Cap, frame: _Frame, order: int, scratch: _Scratch) -> tuple[float, float, int]:
     x, w = unit_rule(order)
     while (n := cap_nodes(*frame, x, w, scratch.directions, scratch.weights)) < 0:
         if scratch.weights.size >= _LARGEST:
@@ -116,11 +121,10 @@ def _sum(term: Term, cap: Cap, frame: tuple[object, ...], order: int, scratch: _
         scratch.resize(2 * scratch.weights.size)
     directions, weights = scratch.directions[:n], scratch.weights[:n]
     viewer, f_r = scratch.viewer[:n], scratch.f_r[:n]
-    cos_n, sin_n, axis = frame[0], frame[1], frame[2]
-    viewer[:] = (-sin_n, 0.0, cos_n)  # type: ignore[operator]
+    viewer[:] = (-frame.sin_n, 0.0, frame.cos_n)
     f_r[:] = 0.0
     accumulate(term.model)(directions, viewer, term.values, term.weight, f_r)
     if cap.profile is not None:
-        f_r *= cap.profile(directions @ np.asarray(axis))
+        f_r *= cap.profile(directions @ frame.axis)
     total = cap.radiance * float(np.dot(weights, f_r))
     return total, abs(total), n
