@@ -1,0 +1,387 @@
+"""rig.toml: the bus, the axes, the camera, the lamp, the white reference, and the simulator's settings.
+
+It knows names, ranges and units; it opens nothing. Angles are in degrees in the file and in radians in the dataclasses.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from gonio.config.reader import Document, Table, read_document
+
+AXES = ("arm", "pan", "tilt")
+COUNTS_PER_TURN = 4096
+SIMULATED = "sim"
+MODELS = ("XM430-W350", "XL430-W250", "XL330-M288")
+
+
+@dataclass(frozen=True)
+class BusConfig:
+    """The servos' line: port (a path, a pyserial URL or ``"sim"``), baud [bit/s], packet timeout in wall time [s]."""
+
+    port: str
+    baud: int
+    timeout_s: float
+
+
+@dataclass(frozen=True)
+class AxisConfig:
+    """One axis.
+
+    Attributes
+    ----------
+    name, model : str
+    id, zero_counts, direction : int
+        Joint angle = direction * (counts - zero_counts) * 2 pi / 4096.
+    lower, upper, velocity, acceleration : float
+        [rad], [rad/s], [rad/s^2].
+    approach : str
+        ``"up"``: the final approach is always with increasing joint angle; ``"down"``; ``"any"``.
+    overshoot : float
+        How far the first leg of a two-leg approach goes beyond the goal [rad].
+    tolerance_counts : int
+        How far from its goal the servo may come to rest; the measured angle is used, never the goal.
+    u_zero : float
+        Standard uncertainty of the axis' zero [rad].
+    """
+
+    name: str
+    id: int
+    model: str
+    zero_counts: int
+    direction: int
+    lower: float
+    upper: float
+    velocity: float
+    acceleration: float
+    approach: Literal["up", "down", "any"]
+    overshoot: float
+    tolerance_counts: int
+    u_zero: float
+
+    def angle(self, counts: float) -> float:
+        """Joint angle [rad] at a position of the servo."""
+        return self.direction * (counts - self.zero_counts) * 2 * math.pi / COUNTS_PER_TURN
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The camera and its noise model.
+
+    Attributes
+    ----------
+    kind : str
+        ``"sim"``, ``"opencv"`` or ``"none"``.
+    exposures_s : tuple of float
+        Exposure bracket [s], ascending.
+    roi : tuple of int
+        Region averaged into one sample: x0, y0, width, height [pixel].
+    distance_mm : float
+        From the camera to the sample's centre.
+    width, height, bit_depth, saturation_dn : int
+    gain_dn_per_e, read_noise_e, offset_dn : float
+        EMVA 1288 noise model: counts per electron, read noise [e], black level [DN].
+    device, backend, pixel_format, discard
+        For ``"opencv"``: device number or path, backend name, FourCC code, frames thrown away before each that counts.
+    """
+
+    kind: Literal["sim", "opencv", "none"]
+    exposures_s: tuple[float, ...]
+    roi: tuple[int, int, int, int]
+    distance_mm: float
+    width: int
+    height: int
+    bit_depth: int
+    saturation_dn: int
+    gain_dn_per_e: float
+    read_noise_e: float
+    offset_dn: float
+    device: int | str
+    backend: str
+    pixel_format: str
+    discard: int
+
+
+@dataclass(frozen=True)
+class LampConfig:
+    """The lamp: kind (``"scpi"`` or ``"manual"``), port, baud, timeout [s], level 0 to 1, warm-up [s], distance [mm]."""
+
+    kind: Literal["scpi", "manual"]
+    port: str
+    baud: int
+    timeout_s: float
+    level: float
+    warm_up_s: float
+    distance_mm: float
+
+
+@dataclass(frozen=True)
+class WhiteConfig:
+    """The white reference.
+
+    Attributes
+    ----------
+    beta, u_beta : float
+        Radiance factor at the reference geometry, and its standard uncertainty [1].
+    arm, pan, tilt : float
+        Joint angles of the reference geometry [rad].
+    repeats : int
+        Brackets in one block.
+    """
+
+    beta: float
+    u_beta: float
+    arm: float
+    pan: float
+    tilt: float
+    repeats: int
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """The simulator: rig seconds per wall second, seed, own process or in this one, truth and scenario as they are."""
+
+    speed: float
+    seed: int
+    process: bool
+    scenario: str | None
+    truth: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RigConfig:
+    """A rig.
+
+    Attributes
+    ----------
+    name : str
+    g_min : float
+        Smallest angle between light arm and camera at which the arm does not stand in the camera's view [rad].
+    settle_s : float
+        Rest after the axes have settled, for the arm to stop ringing [s].
+    moved : float
+        Largest change of a joint angle during an exposure [rad]; beyond it the pose is exposed again.
+    """
+
+    name: str
+    g_min: float
+    settle_s: float
+    moved: float
+    bus: BusConfig
+    axes: Mapping[str, AxisConfig]
+    camera: CameraConfig
+    lamp: LampConfig
+    white: WhiteConfig
+    sim: SimConfig | None
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any device of the rig is the simulator's."""
+        return SIMULATED in (self.bus.port, self.camera.kind, self.lamp.port)
+
+
+def load_rig(path: str | Path) -> RigConfig:
+    """Read a rig file; see `parse_rig`."""
+    return parse_rig(read_document(path), str(path))
+
+
+def parse_rig(text: str, name: str = "rig.toml") -> RigConfig:
+    """The rig that a text describes.
+
+    Raises
+    ------
+    ConfigurationError
+        With every problem of the document at once.
+    """
+    document = Document(text, name)
+    root = document.root
+    rig = root.table("rig")
+    bus = root.table("bus")
+    axes = root.table("axes")
+    sim = _sim(root.table("sim", required=False)) if "sim" in root else None
+    camera = _camera(root.table("camera"), sim)
+    lamp = _lamp(root.table("lamp"))
+    config = RigConfig(
+        name=rig.text("name"),
+        g_min=rig.angle("g_min_deg", 8.0, lower=0.0, upper=90.0),
+        settle_s=rig.number("settle_s", 0.05, lower=0.0, upper=60.0, unit="s"),
+        moved=rig.angle("moved_deg", 0.2, lower=0.0, upper=5.0),
+        bus=BusConfig(
+            port=bus.text("port"),
+            baud=bus.integer("baud", 1_000_000, lower=9600, upper=4_500_000, unit="bit/s"),
+            timeout_s=bus.number("timeout_s", 0.5, lower=0.005, upper=30.0, unit="s"),
+        ),
+        axes={axis: _axis(axes.table(axis), axis) for axis in AXES},
+        camera=camera,
+        lamp=lamp,
+        white=_white(root.table("white")),
+        sim=sim,
+    )
+    for table in (rig, bus, axes, root):
+        table.finish()
+    if not document.problems:
+        _cross_checks(config, root)
+    document.finish()
+    return config
+
+
+def _axis(table: Table, name: str) -> AxisConfig:
+    config = AxisConfig(
+        name=name,
+        id=table.integer("id", lower=0, upper=252),
+        model=table.text("model", "XM430-W350", choices=MODELS),
+        zero_counts=table.integer("zero_counts", 2048, lower=0, upper=COUNTS_PER_TURN - 1, unit="counts"),
+        direction=table.integer("direction", 1, lower=-1, upper=1),
+        lower=table.angle("lower_deg", lower=-180.0, upper=180.0),
+        upper=table.angle("upper_deg", lower=-180.0, upper=180.0),
+        velocity=math.radians(table.number("velocity_deg_s", 60.0, above=0.0, upper=1000.0, unit="degrees/s")),
+        acceleration=math.radians(table.number("acceleration_deg_s2", 300.0, above=0.0, upper=1e5, unit="degrees/s^2")),
+        approach=table.text("approach", "up", choices=("up", "down", "any")),  # type: ignore[arg-type]
+        overshoot=table.angle("overshoot_deg", 2.0, lower=1.0, upper=20.0),
+        tolerance_counts=table.integer("tolerance_counts", 12, lower=1, upper=200, unit="counts"),
+        u_zero=table.angle("u_zero_deg", 0.1, lower=0.0, upper=10.0),
+    )
+    table.finish()
+    if config.direction == 0:
+        table.report("direction", "= 0 turns nowhere; write 1 or -1")
+        return config
+    if not config.lower < config.upper:
+        table.report(
+            "lower_deg", f"= {math.degrees(config.lower):g} must be below upper_deg = {math.degrees(config.upper):g}"
+        )
+    overshoot_counts = config.overshoot * COUNTS_PER_TURN / (2 * math.pi)
+    if config.approach != "any" and not overshoot_counts > config.tolerance_counts:
+        table.report(
+            "overshoot_deg",
+            f"= {math.degrees(config.overshoot):g} is {overshoot_counts:.0f} counts; it must exceed tolerance_counts = "
+            f"{config.tolerance_counts}, or the last approach would not come from one side",
+        )
+    ends = sorted(
+        config.zero_counts + config.direction * a * COUNTS_PER_TURN / (2 * math.pi) for a in (config.lower, config.upper)
+    )
+    if ends[0] < 0 or ends[1] > COUNTS_PER_TURN - 1:
+        table.report(
+            "zero_counts",
+            f"= {config.zero_counts} puts the limits at {ends[0]:.0f} and {ends[1]:.0f} counts; the servo has 0 to "
+            f"{COUNTS_PER_TURN - 1}, so narrow the limits or mount the horn elsewhere",
+        )
+    return config
+
+
+def _camera(table: Table, sim: SimConfig | None) -> CameraConfig:
+    kind = table.text("kind", choices=("sim", "opencv", "none"))
+    if kind == "sim":
+        # the simulated sensor has its size from [sim.truth], where the simulator checks it
+        size = {"width": 160, "height": 120} | (dict(sim.truth) if sim else {})
+        width, height = (size[k] if isinstance(size[k], int) else 20000 for k in ("width", "height"))
+    else:
+        width = table.integer("width", 640, lower=1, upper=20000, unit="pixel")
+        height = table.integer("height", 480, lower=1, upper=20000, unit="pixel")
+    roi = table.integers("roi", count=4, lower=0, upper=20000)
+    bit_depth = table.integer("bit_depth", 12, lower=8, upper=16, unit="bit")
+    device: int | str = 0
+    if table.holds_text("device"):
+        device = table.text("device")
+    else:
+        device = table.integer("device", 0, lower=0, upper=99)
+    config = CameraConfig(
+        kind=kind,  # type: ignore[arg-type]
+        exposures_s=table.numbers("exposures_s", above=0.0, upper=3600.0, unit="s"),
+        roi=roi,  # type: ignore[arg-type]
+        distance_mm=table.number("distance_mm", above=0.0, upper=1e5, unit="mm"),
+        width=width,
+        height=height,
+        bit_depth=bit_depth,
+        saturation_dn=table.integer("saturation_dn", 2**bit_depth - 1, lower=1, upper=2**bit_depth - 1, unit="DN"),
+        gain_dn_per_e=table.number("gain_dn_per_e", above=0.0, upper=1e5, unit="DN/e"),
+        read_noise_e=table.number("read_noise_e", lower=0.0, upper=1e5, unit="e"),
+        offset_dn=table.number("offset_dn", 0.0, lower=0.0, upper=2.0**bit_depth - 1, unit="DN"),
+        device=device,
+        backend=table.text("backend", "auto"),
+        pixel_format=table.text("pixel_format", ""),
+        discard=table.integer("discard", 4, lower=0, upper=100, unit="frames"),
+    )
+    table.finish()
+    exposures = config.exposures_s
+    if any(b <= a for a, b in itertools.pairwise(exposures)):
+        table.report("exposures_s", f"is {list(exposures)}; write each exposure once, the shortest first")
+    x0, y0, w, h = roi
+    if w < 1 or h < 1 or x0 + w > width or y0 + h > height:
+        table.report("roi", f"= {list(roi)} (x0, y0, width, height) must lie within the image of {width} x {height} pixels")
+    return config
+
+
+def _lamp(table: Table) -> LampConfig:
+    kind = table.text("kind", choices=("scpi", "manual"))
+    config = LampConfig(
+        kind=kind,  # type: ignore[arg-type]
+        port=table.text("port") if kind == "scpi" else table.text("port", ""),
+        baud=table.integer("baud", 9600, lower=300, upper=4_500_000, unit="bit/s"),
+        timeout_s=table.number("timeout_s", 2.0, lower=0.005, upper=60.0, unit="s"),
+        level=table.number("level", 1.0, lower=0.0, upper=1.0),
+        warm_up_s=table.number("warm_up_s", 0.0, lower=0.0, upper=7200.0, unit="s"),
+        distance_mm=table.number("distance_mm", above=0.0, upper=1e5, unit="mm"),
+    )
+    table.finish()
+    return config
+
+
+def _white(table: Table) -> WhiteConfig:
+    config = WhiteConfig(
+        beta=table.number("beta", above=0.0, upper=2.0),
+        u_beta=table.number("u_beta", lower=0.0, upper=1.0),
+        arm=table.angle("arm_deg", 30.0, lower=-180.0, upper=180.0),
+        pan=table.angle("pan_deg", 15.0, lower=-180.0, upper=180.0),
+        tilt=table.angle("tilt_deg", 0.0, lower=-180.0, upper=180.0),
+        repeats=table.integer("repeats", 4, lower=1, upper=1000),
+    )
+    table.finish()
+    return config
+
+
+def _sim(table: Table) -> SimConfig:
+    config = SimConfig(
+        speed=table.number("speed", 1.0, above=0.0, upper=1e4, unit="rig seconds per wall second"),
+        seed=table.integer("seed", 1, lower=0, upper=2**53),
+        process=table.flag("process", True),
+        scenario=table.text("scenario", "") or None,
+        truth=table.table("truth", required=False).free(),
+    )
+    table.finish()
+    return config
+
+
+def _cross_checks(config: RigConfig, root: Table) -> None:
+    ids: dict[int, str] = {}
+    for name, axis in config.axes.items():
+        if axis.id in ids:
+            root.document.report(
+                f"axes.{name}", "id", f"= {axis.id} is also that of {ids[axis.id]}; give each servo its own"
+            )
+        ids[axis.id] = name
+        angle = getattr(config.white, name)
+        if not axis.lower <= angle <= axis.upper:
+            root.document.report(
+                "white", f"{name}_deg",
+                f"= {math.degrees(angle):g} is outside the axis' limits [{math.degrees(axis.lower):g}, "
+                f"{math.degrees(axis.upper):g}] degrees; move the reference geometry",
+            )  # fmt: skip
+    if abs(config.white.arm) < config.g_min:
+        root.document.report(
+            "white", "arm_deg",
+            f"= {math.degrees(config.white.arm):g} puts the light arm before the camera; it needs at least "
+            f"{math.degrees(config.g_min):g} degrees (g_min_deg)",
+        )  # fmt: skip
+    if (config.bus.port == SIMULATED) != (config.camera.kind == SIMULATED):
+        root.document.report(
+            "camera", "kind",
+            f'= "{config.camera.kind}" does not go with [bus] port = "{config.bus.port}"; a simulated camera needs the '
+            'simulated bus, and the reverse',
+        )  # fmt: skip
+    if config.lamp.port == SIMULATED and config.bus.port != SIMULATED:
+        root.document.report("lamp", "port", '= "sim" needs [bus] port = "sim" as well')
