@@ -1,0 +1,343 @@
+r"""From scattered BRDF samples to the nodes of a table: local regression with a log link.
+
+Coordinates are functions that are smooth and single-valued for an isotropic, reciprocal, mirror-symmetric BRDF, so that
+no sample is torn from its neighbour at theta_h = 0 or theta_d = 0, where azimuths lose their meaning:
+
+.. math:: x_1 = \frac{\ln(1 + \tan^2(\theta_h/2)/c^2)}{\ln(1 + 1/c^2)},\quad x_2 = 1 - \cos\theta_d,\quad
+          x_3 = (\cos\theta_i - \cos\theta_r)^2 .
+
+With c near half the roughness, the logarithm of a GGX lobe is a straight line in x_1. Around each node the nearest
+samples, weighted by distance [1]_ and by their variance, are fitted with ln f linear or quadratic in x by Fisher scoring on
+f itself, so that noise around zero stays unbiased. The scale c, the order, the number of neighbours and the metric are
+those with the smallest leave-one-out error, and the leave-one-out residuals also calibrate the uncertainty: no parametric
+model of the material enters.
+
+References
+----------
+.. [1] W. S. Cleveland, S. J. Devlin, "Locally Weighted Regression", JASA 83(403), 1988 (tricube weights).
+.. [2] P. McCullagh, J. A. Nelder, Generalized Linear Models, 2nd ed., 1989, section 2.5 (Fisher scoring).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf import tabulated
+from gonio.brdf.base import BRDF
+from gonio.errors import DatasetError
+from gonio.samples import BRDFSamples
+
+Array = NDArray[np.float64]
+MOST = 20_000  # more samples than this are averaged in cells first
+FEWEST = 12
+MISMATCH = 0.02  # relative error of a local polynomial that the weights allow for
+TRIALS = 400  # samples left out, one at a time, to choose the settings
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What leave-one-out chooses: scale c, metric weights of x_1 and x_3, polynomial order, neighbours."""
+
+    c: float = 0.1
+    w_1: float = 2.0
+    w_3: float = 1.0
+    order: int = 1
+    neighbours: int = 12
+
+
+@dataclass(frozen=True)
+class Local:
+    """Local fits: ln f, its standard error, how far outside its neighbours each target is, distance of the nearest."""
+
+    eta: Array  # (m,)
+    sigma: Array  # (m,)
+    outside: Array  # (m,) Mahalanobis distance squared of the target from the cloud of neighbours
+    nearest: Array  # (m,)
+
+
+def coordinates(omega_i: Array, omega_r: Array) -> Array:
+    """tan(theta_h/2), 1 - cos(theta_d) and (cos theta_i - cos theta_r)^2 of pairs of directions, shape (n, 3)."""
+    s, e = omega_i + omega_r, omega_i - omega_r
+    length = np.linalg.norm(s, axis=-1)
+    th = np.hypot(s[..., 0], s[..., 1]) / (length + s[..., 2])
+    # 1 - |s|/2 = |e|^2 / (4 + 2 |s|), without cancellation
+    return np.stack((th, np.sum(e * e, axis=-1) / (4.0 + 2.0 * length), e[..., 2] ** 2), axis=-1)
+
+
+def grid_position(omega_i: Array, omega_r: Array) -> Array:
+    """Position on the table's axes, each in [0, 1], shape (n, 3)."""
+    s, e = omega_i + omega_r, omega_i - omega_r
+    length, st = np.linalg.norm(s, axis=-1), np.hypot(s[..., 0], s[..., 1])
+    across = np.abs(s[..., 0] * e[..., 1] - s[..., 1] * e[..., 0])
+    along = np.abs(e[..., 2]) * length
+    total = along + np.hypot(along, across)
+    c = np.divide(across, total, out=np.zeros_like(total), where=total > 0)
+    return np.stack((np.sqrt(st / (length + s[..., 2])), np.linalg.norm(e, axis=-1) / (length + 2.0), c), axis=-1)
+
+
+def regress(
+    samples: BRDFSamples,
+    *,
+    fill: BRDF | None,
+    shape: tuple[int, int, int],
+    progress: Callable[[int, int], None] | None,
+) -> tabulated.TabulatedBRDF:
+    """Table of the samples; `gonio.brdf.tabulated.tabulate` says what goes in and out."""
+    omega_i, omega_r = samples.omega_i(), samples.omega_r()
+    x, f, u = coordinates(omega_i, omega_r), samples.f_r, samples.u_f_r
+    if len(f) < FEWEST:
+        raise DatasetError(f"a table needs at least {FEWEST} samples, there are {len(f)}; fit a model instead")
+    if not np.any(f > 0):
+        raise DatasetError(f"none of the {len(f)} samples is positive; check the dark frames and the quantity")
+    u, known = _uncertainty(f, u)
+    position = grid_position(omega_i, omega_r)
+    if len(f) > MOST:
+        x, f, u = _binned(x, f, u, position, shape)
+    data = _Data(x, f, u, known)
+
+    node_i, node_r, below = tabulated.node_directions(shape)
+    targets = coordinates(node_i.reshape(-1, 3), node_r.reshape(-1, 3))
+    chunks = -(-len(targets) // 2048)
+    total = chunks + 4
+
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
+    tell(0)
+    settings, scale = _choose(data)
+    tell(4)
+    found = []
+    for chunk in range(chunks):
+        found.append(data.fit(targets[chunk * 2048 : (chunk + 1) * 2048], settings))
+        tell(4 + chunk + 1)
+    local = Local(*(np.concatenate([getattr(part, n) for part in found]) for n in ("eta", "sigma", "outside", "nearest")))
+
+    # outside its neighbours, or far from all of them: a straight line only, and an error that grows with the distance
+    spacing = data.spacing(settings)
+    far = (local.outside > 6.0) | (local.nearest > 4.0 * spacing)
+    eta, sigma = local.eta.copy(), scale * local.sigma * np.sqrt(1.0 + (local.nearest / spacing) ** 2 / 4.0)
+    if np.any(far):
+        straight = data.fit(targets[far], replace(settings, order=1, neighbours=max(settings.neighbours, 12)))
+        eta[far] = straight.eta
+        beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing / 4.0
+        sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, np.minimum(0.2 + 0.2 * beyond, 2.0))
+    eta, sigma = eta.reshape(shape), np.minimum(sigma, 3.0).reshape(shape)
+    far = far.reshape(shape)
+    value = np.exp(eta)
+
+    coverage = np.where(far, tabulated.EXTRAPOLATED, tabulated.INTERPOLATED).astype(np.uint8)
+    cell = np.rint(position * (np.array(shape) - 1)).astype(np.int64)
+    coverage[tuple(cell.T)] = tabulated.MEASURED
+    # where azimuth has no meaning, one sample measures the node at all of them
+    for edge in (np.index_exp[0, :, :], np.index_exp[:, 0, :]):
+        touched = np.any(coverage[edge] == tabulated.MEASURED, axis=-1)
+        coverage[edge][touched] = tabulated.MEASURED
+    relative_u = sigma
+    if fill is not None:
+        holes = far & (coverage != tabulated.MEASURED)
+        value[holes] = fill.evaluate(node_i[holes], node_r[holes])
+        relative_u = np.where(holes, _misfit(fill, samples, known), sigma)
+        coverage[holes] = tabulated.MODEL
+    coverage[below] = tabulated.BELOW_HORIZON
+    attributes = {
+        **samples.attributes,
+        "quantity": "brdf",
+        "n_samples": str(len(samples)),
+        "regression": (
+            f"ln f local polynomial of order {settings.order} over {settings.neighbours} neighbours, "
+            f"lobe scale c = {settings.c:g}, error scale {scale:.3g}"
+        ),
+        "fill": "none" if fill is None else repr(fill),
+        "uncertainty": "k = 1; random errors, scatter and interpolation; shared errors are not included",
+    }
+    return tabulated.TabulatedBRDF(value, value * relative_u, coverage, attributes)
+
+
+class _Data:
+    """Samples in coordinates, ready for neighbour searches under changing settings."""
+
+    def __init__(self, x: Array, f: Array, u: Array, known: bool) -> None:
+        self.x, self.f, self.u, self.known = x, f, u, known
+        positive = f[f > 0]
+        self.floor = max(1e-6 * float(np.quantile(positive, 0.99)), 0.3 * float(positive.min()))
+        self._tree: tuple[tuple[float, float, float], object, Array] | None = None
+
+    def metric(self, x: Array, settings: Settings) -> Array:
+        c2 = settings.c**2
+        x_1 = np.log1p(x[:, 0] ** 2 / c2) / np.log1p(1.0 / c2)
+        return np.stack((settings.w_1 * x_1, x[:, 1], settings.w_3 * x[:, 2]), axis=-1)
+
+    def tree(self, settings: Settings) -> tuple[object, Array]:
+        from scipy.spatial import cKDTree
+
+        key = (settings.c, settings.w_1, settings.w_3)
+        if self._tree is None or self._tree[0] != key:
+            points = self.metric(self.x, settings)
+            self._tree = (key, cKDTree(points), points)
+        return self._tree[1], self._tree[2]
+
+    def spacing(self, settings: Settings) -> float:
+        """Typical distance from a sample to its third neighbour."""
+        tree, points = self.tree(settings)
+        step = max(1, len(points) // 2000)
+        distance, _ = tree.query(points[::step], 4)  # type: ignore[attr-defined]
+        return max(float(np.median(distance[:, 3])), 1e-9)
+
+    def fit(self, targets: Array, settings: Settings, leave_out: NDArray[np.int64] | None = None) -> Local:
+        """Local fits at the targets (m, 3); with `leave_out`, target j ignores sample leave_out[j]."""
+        tree, points = self.tree(settings)
+        at = self.metric(targets, settings)
+        k = min(settings.neighbours, len(points) - (leave_out is not None))
+        order = settings.order if k >= 14 else 1
+        if leave_out is None:
+            distance, index = tree.query(at, k)  # type: ignore[attr-defined]
+        else:
+            distance, index = tree.query(at, k + 1)  # type: ignore[attr-defined]
+            own = index == leave_out[:, None]
+            own[~own.any(axis=1), -1] = True
+            distance, index = distance[~own].reshape(-1, k), index[~own].reshape(-1, k)
+        reach = 1.05 * distance[:, -1:] + 1e-12
+        kernel = (1.0 - (distance / reach) ** 3) ** 3 + 1e-6
+        z = (points[index] - at[:, None, :]) / reach[..., None]  # (m, k, 3)
+        columns = [np.ones(z.shape[:2]), z[..., 0], z[..., 1], z[..., 2]]
+        if order == 2:
+            columns += [z[..., i] * z[..., j] for i in range(3) for j in range(i, 3)]
+        design = np.stack(columns, axis=-1)
+        f, u2 = self.f[index], self.u[index] ** 2
+
+        raised = np.maximum(f, np.maximum(self.floor, 0.5 * np.sqrt(u2)))
+        log_f = np.log(raised)
+        low, high = log_f.min(axis=1, keepdims=True) - 1.0, log_f.max(axis=1, keepdims=True) + 1.0
+        eta, response = log_f, log_f
+        mu = raised
+        for _ in range(5):
+            noise = u2 + (MISMATCH * mu) ** 2
+            precision = kernel * mu * mu / noise  # of the working response ln mu + (f - mu)/mu
+            beta, first = _solve(design, precision, response)
+            eta = np.clip(np.einsum("mkp,mp->mk", design, beta), low, high)
+            mu = np.exp(eta)
+            response = eta + np.clip(f / mu - 1.0, -3.0, 3.0)
+        center = np.clip(beta[:, 0], low[:, 0], high[:, 0])
+        smoother = precision * np.einsum("mkp,mp->mk", design, first)
+        variance = np.sum(smoother**2 * noise / (mu * mu), axis=1)
+        cloud = np.concatenate((z, np.zeros_like(z[:, :1])), axis=1)
+        mean = z.mean(axis=1)
+        spread = np.einsum("mki,mkj->mij", cloud - mean[:, None], cloud - mean[:, None]) / cloud.shape[1]
+        spread += 1e-4 * np.eye(3)
+        outside = np.einsum("mi,mi->m", mean, np.linalg.solve(spread, mean[..., None])[..., 0])
+        return Local(center, np.sqrt(variance), outside, distance[:, 0])
+
+
+def _solve(design: Array, precision: Array, response: Array) -> tuple[Array, Array]:
+    """Weighted least squares for all targets: coefficients, and the first row of the inverse normal matrix."""
+    weighted = design * precision[..., None]
+    normal = np.swapaxes(weighted, 1, 2) @ design
+    ridge = np.full(design.shape[2], 1e-3)
+    ridge[0] = 1e-9
+    normal += ridge * np.eye(len(ridge)) * precision.sum(axis=1)[:, None, None]
+    right = np.einsum("mkp,mk->mp", weighted, response)
+    unit = np.zeros_like(right)
+    unit[:, 0] = 1.0
+    both = np.linalg.solve(normal, np.stack((right, unit), axis=-1))
+    return both[..., 0], both[..., 1]
+
+
+def _choose(data: _Data) -> tuple[Settings, float]:
+    """Settings with the smallest leave-one-out error, one coordinate at a time, and the scale of the standard errors."""
+    n = len(data.f)
+    left_out = np.unique(np.linspace(0, n - 1, min(n, TRIALS)).astype(np.int64))
+    f, u = data.f[left_out], data.u[left_out]
+    noise = u if data.known else 0.0 * u
+
+    def residual(settings: Settings) -> tuple[Array, Local]:
+        local = data.fit(data.x[left_out], settings, left_out)
+        mu = np.exp(local.eta)
+        return 2.0 * (f - mu) / (np.abs(f) + mu + 2.0 * noise + data.floor), local
+
+    def error(settings: Settings) -> float:
+        r, _ = residual(settings)
+        return float(np.mean(np.minimum(np.abs(r), 0.5) ** 2))
+
+    best = Settings(neighbours=min(12, n - 1))
+    least = error(best)
+    orders = [(1, 8), (1, 20), (2, 16), (2, 24), (2, 40), (2, 64)]
+    ladder: list[dict[str, list[float]] | list[tuple[int, int]]] = [
+        {"c": [0.01, 0.03, 0.3, 1.0]},
+        orders,
+        {"w_1": [0.7, 1.4, 4.0]},
+        {"w_3": [0.3, 3.0]},
+        {"c": [0.01, 0.03, 0.06, 0.1, 0.18, 0.3]},
+        orders,
+    ]
+    for rung in ladder:
+        if isinstance(rung, list):
+            options = [replace(best, order=o, neighbours=k) for o, k in rung if k < n]
+        else:
+            options = [replace(best, **{name: value}) for name, values in rung.items() for value in values]  # type: ignore[arg-type]
+        for option in options:
+            if option != best and (e := error(option)) < 0.995 * least:
+                best, least = option, e
+
+    # scale of the standard errors: two thirds of the leave-one-out residuals within one of them
+    _, local = residual(best)
+    mu = np.exp(local.eta)
+    deviation = np.abs(f - mu)
+    inside = local.outside < 6.0
+    if np.count_nonzero(inside) < FEWEST:
+        inside[:] = True
+    low, high = 0.3, 30.0
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        pull = deviation / np.sqrt(noise**2 + (middle * mu * local.sigma) ** 2 + 1e-300)
+        if np.quantile(pull[inside], 0.683) > 1.0:
+            low = middle
+        else:
+            high = middle
+    return best, float(np.sqrt(low * high))
+
+
+def _uncertainty(f: Array, u: Array) -> tuple[Array, bool]:
+    """Working uncertainty of each sample, and whether it was known for most of them."""
+    known = np.isfinite(u) & (u > 0)
+    if np.count_nonzero(known) >= len(f) / 2:
+        relative = float(np.median(u[known] / np.maximum(np.abs(f[known]), np.median(np.abs(f)))))
+        return np.where(known, u, relative * np.abs(f) + np.median(u[known])), True
+    # negative values can only be noise: they tell its size where nothing else does
+    negative = f[f < 0]
+    absolute = float(np.sqrt(np.mean(negative**2))) if len(negative) else 1e-3 * float(np.median(np.abs(f)))
+    return np.hypot(MISMATCH * np.abs(f), absolute), False
+
+
+def _binned(x: Array, f: Array, u: Array, position: Array, shape: tuple[int, int, int]) -> tuple[Array, Array, Array]:
+    """Weighted means over cells of half a node step, doubled until few enough are left."""
+    size = 0.5
+    while True:
+        counts = np.ceil((np.array(shape) - 1) / size).astype(np.int64) + 1
+        cell = np.rint(position / size * (np.array(shape) - 1)).astype(np.int64)
+        key = (cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
+        _, inverse = np.unique(key, return_inverse=True)
+        groups = int(inverse.max()) + 1
+        if groups <= MOST or size >= 16:
+            break
+        size *= 2.0 ** (1 / 3) if groups < 2 * MOST else 2.0
+    weight = 1.0 / (u**2 + (MISMATCH * np.abs(f)) ** 2 + 1e-300)
+    # within a cell a common mean weight, or the smaller values would win
+    mean_weight = np.bincount(inverse, weight) / np.bincount(inverse)
+    count = np.bincount(inverse).astype(float)
+    columns = [np.bincount(inverse, x[:, i]) / count for i in range(3)]
+    mean_f = np.bincount(inverse, f) / count
+    return np.stack(columns, axis=-1), mean_f, 1.0 / np.sqrt(mean_weight * count)
+
+
+def _misfit(fill: BRDF, samples: BRDFSamples, known: bool) -> float:
+    """Relative standard uncertainty of a fitted model off the samples: twice its robust misfit on them."""
+    predicted = fill.evaluate(samples.omega_i(), samples.omega_r())
+    deviation = np.abs(samples.f_r - predicted)
+    u = np.nan_to_num(samples.u_f_r) if known else np.zeros_like(deviation)
+    excess = np.sqrt(np.maximum(deviation**2 - u**2, 0.0)) / np.maximum(predicted, 1e-300)
+    return float(np.clip(2.0 * np.quantile(excess, 0.683), 0.02, 2.0))
