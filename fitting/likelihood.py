@@ -1,0 +1,294 @@
+r"""The likelihood of BRDF samples: shared errors as parameters, independent ones as variance of the model's own making.
+
+With the expected reading of `gonio.samples`,
+
+.. math:: \ln L = -\tfrac12\sum_j\Bigl[\frac{(f_j-\hat f_j)^2}{s_j^2}+\ln s_j^2\Bigr],\qquad
+   s_j^2 = u_j^2 + \sum_k\Bigl(\frac{\partial\hat f_j}{\partial\delta_k}\,u_{\mathrm{sample},k}\Bigr)^2
+         + (\epsilon\hat f_j)^2 + [u_j\ \text{unknown}]\,\bigl((r\hat f_j)^2+a^2\bigr).
+
+Every part of the variance that scales with the reading is taken from the model, never from the noisy reading, which
+would pull the fit towards low readings; so the term ln s^2 stays. The slope is a finite difference of the compiled model
+at the parameters of the moment: a slope frozen at the optimum would let a walker with a narrower lobe claim the error of
+a wider one. It is linear in the angular error, so `u_sample` must be small against the width of a lobe.
+
+`noise.relative` (r) and `noise.absolute` (a) are inferred where a sample has no uncertainty; `noise.discrepancy`
+(epsilon) allows for a model that is not the material. This module draws nothing and chooses no parameters.
+
+References
+----------
+.. [1] JCGM 100:2008 (GUM), 5.1.2 and 5.2.2: propagation by sensitivity coefficients, independent and correlated.
+.. [2] M. C. Kennedy, A. O'Hagan, "Bayesian calibration of computer models", JRSS B 63(3), 2001: model discrepancy.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitting.parameters import Declared, Space, declare
+from gonio import jit
+from gonio.brdf import Model
+from gonio.errors import DatasetError, ParameterError
+from gonio.samples import BRDFSamples
+
+Array = NDArray[np.float64]
+STEP = 1e-6  # of a shared error, for slopes: f'' STEP / f' is 1e-5 for a lobe of 0.1 rad, rounding 1e-10
+BLOCK = 512  # samples at a time: one block of 16 walkers and 4 geometries stays in the cache
+RELATIVE, ABSOLUTE, DISCREPANCY = "noise.relative", "noise.absolute", "noise.discrepancy"
+
+
+def _directions(base, slope, full, offset, varied, step, out):  # type: ignore[no-untyped-def]
+    """Perturbed unit vectors: base (6, n), slope (k, 6, n) -> out (w, 1 + v, 6, n).
+
+    A direction that was measured was above the horizon, so z stays positive.
+    """
+    n = base.shape[1]
+    for w in range(out.shape[0]):
+        raw = out[w, 0]
+        raw[:] = base
+        for k in range(slope.shape[0]):
+            delta = full[w, offset + k]
+            if delta != 0.0:
+                for c in range(6):
+                    for j in range(n):
+                        raw[c, j] += delta * slope[k, c, j]
+        for v in range(varied.size):
+            shifted, change = out[w, v + 1], slope[varied[v]]
+            for c in range(6):
+                for j in range(n):
+                    shifted[c, j] = raw[c, j] + step * change[c, j]
+        for v in range(out.shape[1]):
+            for c in (0, 3):
+                x, y, z = out[w, v, c], out[w, v, c + 1], out[w, v, c + 2]
+                for j in range(n):
+                    z[j] = max(z[j], 1e-9)
+                    r = 1.0 / math.sqrt(x[j] * x[j] + y[j] * y[j] + z[j] * z[j])
+                    x[j] *= r
+                    y[j] *= r
+                    z[j] *= r
+
+
+def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_sample, step, u2, unknown, mean, var):  # type: ignore[no-untyped-def]
+    """Expected readings and variances: values (w, 1 + v, n) -> mean, var (w, n)."""
+    n = u2.size
+    for w in range(values.shape[0]):
+        f, m, s2 = values[w, 0], mean[w], var[w]
+        factor = np.ones(n)
+        if has_log:
+            factor[:] = 0.0
+            for k in range(log_slope.shape[0]):
+                delta = full[w, offset + k]
+                for j in range(n):
+                    factor[j] += delta * log_slope[k, j]
+            for j in range(n):
+                factor[j] = math.exp(factor[j])
+        relative2, absolute2, epsilon2 = full[w, noise] ** 2, full[w, noise + 1] ** 2, full[w, noise + 2] ** 2
+        for j in range(n):
+            m[j] = f[j] * factor[j]
+            s2[j] = u2[j] + epsilon2 * m[j] * m[j] + unknown[j] * (relative2 * m[j] * m[j] + absolute2)
+        for q in range(noisy.size):
+            k = noisy[q]
+            shifted = values[w, variant[q]]  # the unshifted geometry itself where the error does not turn anything
+            for j in range(n):
+                d = (factor[j] * (shifted[j] - f[j]) / step + m[j] * log_slope[k, j]) * u_sample[k]
+                s2[j] += d * d
+
+
+def _reduce(mean, var, reading, log_likelihood, chi2):  # type: ignore[no-untyped-def]
+    for w in range(mean.shape[0]):
+        c, l = 0.0, 0.0
+        for j in range(reading.size):
+            r = reading[j] - mean[w, j]
+            c += r * r / var[w, j]
+        for j in range(reading.size):
+            l += math.log(var[w, j])
+        chi2[w] += c
+        log_likelihood[w] -= 0.5 * (c + l)
+
+
+_directions_kernel, _moments_kernel, _reduce_kernel = jit.kernel(_directions), jit.kernel(_moments), jit.kernel(_reduce)
+
+
+@functools.cache
+def _term_kernel(function: Callable[..., float]) -> Any:
+    """Add one model's f_r: directions (w or 1, v, 6, n), full (w, all) from column `first` on, out (w, v, n)."""
+
+    def accumulate_walkers(directions, full, first, count, out):  # type: ignore[no-untyped-def]
+        for w in range(out.shape[0]):
+            p = full[w, first : first + count]
+            for v in range(out.shape[1]):
+                d = directions[w if directions.shape[0] > 1 else 0, v]
+                xi, yi, zi, xr, yr, zr, to = d[0], d[1], d[2], d[3], d[4], d[5], out[w, v]
+                for j in range(to.size):
+                    to[j] += function(xi[j], yi[j], zi[j], xr[j], yr[j], zr[j], p)
+
+    return jit.kernel(accumulate_walkers)
+
+
+def shared_parameters(samples: BRDFSamples, use: bool) -> list[Declared]:
+    """A parameter for each shared error, prior N(0, u); held at 0 if its u is 0 or `use` is False."""
+    names = [error.name for error in samples.shared]
+    for name in names:
+        if names.count(name) > 1:
+            raise DatasetError(f"samples: {names.count(name)} shared errors are called {name!r}; names must differ")
+    return [
+        Declared(
+            f"shared.{e.name}", -math.inf, math.inf, ("normal", 0.0, e.u or 1.0), e.unit, None if use and e.u > 0 else 0.0
+        )
+        for e in samples.shared
+    ]
+
+
+def noise_parameters(samples: BRDFSamples, discrepancy: bool) -> list[Declared]:
+    """``noise.relative``, ``noise.absolute`` and ``noise.discrepancy``, held at 0 where they are not needed.
+
+    The priors are half-normal and wide: sd 0.3 for r; the root mean square of the readings without an uncertainty for a;
+    0.1 for epsilon. The lower ends, 1e-4 and 1e-6 of the scale, keep the likelihood finite for noise-free data; no
+    goniometer repeats better.
+    """
+    unknown = np.isnan(samples.u_f_r)
+    rms = float(np.sqrt(np.mean(samples.f_r[unknown] ** 2))) if unknown.any() else 1.0
+    rms = rms if rms > 0 else 1.0
+    infer = None if unknown.any() else 0.0
+    return [
+        Declared(RELATIVE, 1e-4, 3.0, ("half_normal", 0.3), "1", infer),
+        Declared(ABSOLUTE, 1e-6 * rms, 10.0 * rms, ("half_normal", rms), "1/sr", infer),
+        Declared(DISCREPANCY, 1e-4, 3.0, ("half_normal", 0.1), "1", None if discrepancy else 0.0),
+    ]
+
+
+class Problem:
+    """Samples, model and priors: everything that a fit needs.
+
+    Parameters
+    ----------
+    samples : BRDFSamples
+    models : sequence of Model
+        Terms of the sum.
+    free, fix, priors
+        See `fitting.parameters.Space`.
+    shared : bool
+        Infer the shared errors; False holds them at 0.
+    discrepancy : bool
+        Infer ``noise.discrepancy``.
+
+    Raises
+    ------
+    DatasetError
+        If there are no samples, or an uncertainty is zero.
+    ParameterError
+        If nothing of the model is free.
+    """
+
+    def __init__(
+        self,
+        samples: BRDFSamples,
+        models: Sequence[Model],
+        *,
+        free: Sequence[str] = (),
+        fix: dict[str, float] | None = None,
+        priors: dict[str, Sequence[object]] | None = None,
+        shared: bool = True,
+        discrepancy: bool = False,
+    ) -> None:
+        if len(samples) == 0:
+            raise DatasetError("there are no samples to fit: scan or import some first")
+        if np.any(samples.u_f_r == 0):
+            worst = int(np.flatnonzero(samples.u_f_r == 0)[0])
+            raise DatasetError(f"sample {worst} has u_f_r = 0 1/sr; give its standard uncertainty, or nan if it is unknown")
+        if np.any((samples.f_r != 0) & (np.abs(samples.f_r) > 1e100)):
+            worst = int(np.argmax(np.abs(samples.f_r)))
+            raise DatasetError(f"sample {worst} has f_r = {samples.f_r[worst]:g} 1/sr; that is no reading, remove it")
+        self.samples, self.models = samples, tuple(models)
+        own = declare(self.models)
+        errors = shared_parameters(samples, shared)
+        self.space = Space(
+            [*own, *errors, *noise_parameters(samples, discrepancy)], free=free, fix=fix, priors=priors
+        )
+        self.model_names = tuple(name for name in self.space.names if name in {p.name for p in own})
+        if not self.model_names:
+            raise ParameterError("every parameter of the model is fixed; free at least one")
+        starts = np.cumsum([0, *(len(m.parameters) for m in self.models)])
+        self._terms = [
+            (_term_kernel(m.function), int(a), len(m.parameters))
+            for m, a in zip(self.models, starts, strict=False)
+            if m.function is not None
+        ]
+        self._offset, self._noise = len(own), len(own) + len(errors)
+        self._geometry(errors)
+
+    def _geometry(self, errors: Sequence[Declared]) -> None:
+        """Arrays of the kernels, component by component and cut into blocks."""
+        s, k = self.samples, len(errors)
+        base = np.ascontiguousarray(np.concatenate((s.omega_i(), s.omega_r()), axis=1).T)  # (6, n)
+        slope = np.concatenate((s.d_omega_i, s.d_omega_r), axis=1).transpose(2, 1, 0)  # (k, 6, n)
+        turns = np.array([bool(np.any(slope[i])) for i in range(k)], dtype=bool)
+        self._u_sample = np.array([e.u_sample for e in s.shared], dtype=float)
+        self._noisy = np.flatnonzero(self._u_sample > 0)
+        self._varied = np.array([i for i in self._noisy if turns[i]], dtype=np.int64)
+        place = {int(i): v + 1 for v, i in enumerate(self._varied)}
+        self._variant = np.array([place.get(int(i), 0) for i in self._noisy], dtype=np.int64)
+        names = set(self.space.names)
+        self._moves = any(turns[i] and e.name in names for i, e in enumerate(errors))
+        self._has_log = bool(np.any(s.d_ln_f))
+        unknown = np.isnan(s.u_f_r)
+        u2 = np.where(unknown, 0.0, np.nan_to_num(s.u_f_r)) ** 2
+        self._blocks = []
+        for a in range(0, len(s), BLOCK):
+            cut = slice(a, a + BLOCK)
+            block = (
+                np.ascontiguousarray(base[:, cut]),
+                np.ascontiguousarray(slope[:, :, cut]),
+                np.ascontiguousarray(s.d_ln_f[cut].T),
+                u2[cut].copy(),
+                unknown[cut].astype(float),
+                s.f_r[cut].copy(),
+            )
+            held = None
+            if not self._moves:
+                held = np.empty((1, 1 + len(self._varied), 6, block[0].shape[1]))
+                constant = np.nan_to_num(self.space.template)[None, :]
+                _directions_kernel(block[0], block[1], constant, self._offset, self._varied, STEP, held)
+            self._blocks.append((block, held))
+
+    def _moments_of(self, full: Array, index: int) -> tuple[Array, Array]:
+        (base, slope, log_slope, u2, unknown, _), directions = self._blocks[index]
+        shape = (len(full), 1 + len(self._varied), base.shape[1])
+        if directions is None:
+            directions = np.empty((shape[0], shape[1], 6, shape[2]))
+            _directions_kernel(base, slope, full, self._offset, self._varied, STEP, directions)
+        values = np.zeros(shape)
+        for kernel, first, count in self._terms:
+            kernel(directions, full, first, count, values)
+        mean, var = np.empty((shape[0], shape[2])), np.empty((shape[0], shape[2]))
+        _moments_kernel(
+            values, full, self._offset, self._noise, log_slope, self._has_log, self._noisy, self._variant,
+            self._u_sample, STEP, u2, unknown, mean, var,
+        )  # fmt: skip
+        return mean, var
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        """Expected readings [1/sr] and their variances [1/sr^2], each (w, n), for free parameters x, shape (w, d)."""
+        full = self.space.full(np.atleast_2d(x))
+        parts = [self._moments_of(full, i) for i in range(len(self._blocks))]
+        return np.concatenate([m for m, _ in parts], axis=1), np.concatenate([v for _, v in parts], axis=1)
+
+    def log_likelihood(self, x: Array) -> tuple[Array, Array]:
+        """ln L (up to a constant; -inf where it is not finite) and chi^2, each (w,), for free parameters x, (w, d)."""
+        full = self.space.full(x)
+        total, chi2 = np.zeros(len(full)), np.zeros(len(full))
+        for i, (block, _) in enumerate(self._blocks):
+            mean, var = self._moments_of(full, i)
+            _reduce_kernel(mean, var, block[5], total, chi2)
+        return np.where(np.isfinite(total), total, -np.inf), chi2
+
+    def log_probability(self, u: Array) -> Array:
+        """Log posterior density of the unbounded coordinates, up to a constant: (w, d) -> (w,); never NaN."""
+        x, log_prior = self.space.natural(u)
+        total = log_prior + self.log_likelihood(x)[0]
+        return np.where(np.isfinite(total), total, -np.inf)

@@ -1,0 +1,235 @@
+r"""The parameters of a fit: which are free, which are held, and the unbounded coordinates in which a sampler walks.
+
+A parameter of the model, a shared error and a noise term are treated alike. A bounded parameter x is walked as
+
+.. math:: u = \operatorname{logit}\frac{g(x)-g(a)}{g(b)-g(a)}, \qquad g(x) = x \text{ or } \ln x,
+
+the logarithm where the prior is one of a scale; an unbounded one as ``u = (x - mean) / sd`` of its normal prior. The
+density of u holds the Jacobian dx/du, so the posterior of x does not depend on the choice.
+
+This module knows names, ranges and priors, but no data.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitting.priors import HALF_NORMAL, LOG_NORMAL, LOG_UNIFORM, NORMAL, UNIFORM, Prior, prior
+from gonio import jit
+from gonio.brdf import Model, term_names
+from gonio.errors import ParameterError
+
+Array = NDArray[np.float64]
+_AFFINE, _LOGIT, _LOGIT_OF_LN = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Declared:
+    """One parameter that a fit may free.
+
+    Attributes
+    ----------
+    name : str
+        Qualified: ``"ggx.alpha"``, ``"shared.scale"``, ``"noise.relative"``.
+    lower, upper : float
+        Range; infinite for a shared error.
+    prior : tuple
+        See `fitting.priors`.
+    unit : str
+    held : float, optional
+        Value at which it stays unless it is freed.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    prior: tuple[object, ...]
+    unit: str = "1"
+    held: float | None = None
+
+
+def declare(models: Sequence[Model]) -> list[Declared]:
+    """The parameters of a sum of models, in the order of their parameter arrays."""
+    declared = []
+    for term, model in zip(term_names(models), models, strict=True):
+        if model.function is None:
+            raise ParameterError(f"{model.name} is a delta function and has no value at a pair of directions; leave it out")
+        declared += [Declared(f"{term}.{p.name}", p.lower, p.upper, p.prior, p.unit, p.fixed) for p in model.parameters]
+    return declared
+
+
+def _forward(u, form, lower, upper, code, a, b, x, log_prior):  # type: ignore[no-untyped-def]
+    """x and the log density of u, Jacobian included; u (w, d) -> x (w, d), log_prior (w,)."""
+    for w in range(u.shape[0]):
+        total = 0.0
+        for i in range(u.shape[1]):
+            if form[i] == _AFFINE:
+                value = a[i] + b[i] * u[w, i]
+                log_x = 0.0
+            else:
+                # sigma(u) and ln(sigma (1 - sigma)) without overflow
+                e = math.exp(-abs(u[w, i]))
+                total += -abs(u[w, i]) - 2.0 * math.log1p(e)
+                s = 1.0 / (1.0 + e) if u[w, i] >= 0.0 else e / (1.0 + e)
+                if form[i] == _LOGIT:
+                    value = lower[i] + (upper[i] - lower[i]) * s
+                    log_x = math.log(value) if code[i] == LOG_NORMAL or code[i] == LOG_UNIFORM else 0.0
+                else:
+                    l0 = math.log(lower[i])
+                    log_x = l0 + (math.log(upper[i]) - l0) * s
+                    value = math.exp(log_x)
+                    total += log_x  # dx/d ln x = x
+                value = min(max(value, lower[i]), upper[i])
+            x[w, i] = value
+            if code[i] == NORMAL or code[i] == HALF_NORMAL:
+                z = (value - a[i]) / b[i]
+                total -= 0.5 * z * z
+            elif code[i] == LOG_NORMAL:
+                z = (log_x - a[i]) / b[i]
+                total -= log_x + 0.5 * z * z
+            elif code[i] == LOG_UNIFORM:
+                total -= log_x
+        log_prior[w] = total
+
+
+_forward_kernel = jit.kernel(_forward)
+
+
+class Space:
+    """Free and held parameters of one fit.
+
+    Parameters
+    ----------
+    declared : iterable of Declared
+        All of them.
+    free : iterable of str
+        Names to free although their declaration holds them.
+    fix : mapping of str to float
+        Names to hold, with their values.
+    priors : mapping of str to tuple
+        Priors that replace the declared ones.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The free parameters, d of them.
+    priors : tuple of Prior
+    fixed : dict of str to float
+        The held ones.
+    columns : ndarray of int, shape (d,)
+        Places of the free parameters among the declared ones.
+    template : ndarray, shape (number declared,)
+        Held values; NaN where free.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown (the nearest one is suggested), named twice, or a value is out of its range.
+    """
+
+    def __init__(
+        self,
+        declared: Iterable[Declared],
+        *,
+        free: Iterable[str] = (),
+        fix: Mapping[str, float] | None = None,
+        priors: Mapping[str, Sequence[object]] | None = None,
+    ) -> None:
+        self.declared = tuple(declared)
+        known = [p.name for p in self.declared]
+        free, fix, priors = tuple(free), dict(fix or {}), dict(priors or {})
+        for option, names in (("free", free), ("fix", fix), ("priors", priors)):
+            for name in names:
+                if name not in known:
+                    near = suggestion(name, known)
+                    raise ParameterError(f"{option}: no parameter {name!r}{near}; this fit has: {', '.join(known)}")
+        for name in free:
+            if name in fix:
+                raise ParameterError(f"{name} is to be free and fixed at {fix[name]:g} at once; name it in one place")
+        self.fixed: dict[str, float] = {}
+        for p in self.declared:
+            if p.name in fix:
+                value = float(fix[p.name])
+                if value != p.held and not (math.isfinite(value) and p.lower <= value <= p.upper):
+                    raise ParameterError(f"fix: {p.name} = {value:g} is outside [{p.lower:g}, {p.upper:g}] {p.unit}")
+                self.fixed[p.name] = value
+            elif p.held is not None and p.name not in free and p.name not in priors:
+                self.fixed[p.name] = p.held
+        for name in priors:
+            if name in self.fixed:
+                raise ParameterError(f"{name} is fixed at {self.fixed[name]:g} and has a prior as well; choose one of them")
+        kept = [(i, p) for i, p in enumerate(self.declared) if p.name not in self.fixed]
+        self.names = tuple(p.name for _, p in kept)
+        self.priors = tuple(prior(priors.get(p.name, p.prior), p.lower, p.upper, p.name) for _, p in kept)
+        self.units = {p.name: p.unit for _, p in kept}
+        self.columns = np.array([i for i, _ in kept], dtype=np.int64)
+        self.template = np.array([self.fixed.get(p.name, math.nan) for p in self.declared])
+        forms = [_AFFINE if not q.bounded else _LOGIT_OF_LN if q.logarithmic else _LOGIT for q in self.priors]
+        self._form = np.array(forms, dtype=np.int64)
+        self._code = np.array([q.code for q in self.priors], dtype=np.int64)
+        self._lower, self._upper, self._a, self._b = (
+            np.array([getattr(q, key) for q in self.priors], dtype=float) for key in ("lower", "upper", "a", "b")
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def natural(self, u: Array) -> tuple[Array, Array]:
+        """Natural values and the log prior density of u, Jacobian included.
+
+        Parameters
+        ----------
+        u : ndarray, shape (w, d)
+
+        Returns
+        -------
+        x : ndarray, shape (w, d)
+        log_prior : ndarray, shape (w,)
+            Up to a constant.
+        """
+        u = np.ascontiguousarray(u, dtype=float)
+        x, log_prior = np.empty_like(u), np.empty(len(u))
+        _forward_kernel(u, self._form, self._lower, self._upper, self._code, self._a, self._b, x, log_prior)
+        return x, log_prior
+
+    def unbounded(self, x: Array) -> Array:
+        """Coordinates u of natural values, shape (w, d); values on an edge end 1e-9 of the range inside."""
+        x = np.asarray(x, dtype=float)
+        u = np.empty_like(x)
+        for i, q in enumerate(self.priors):
+            if self._form[i] == _AFFINE:
+                u[:, i] = (x[:, i] - q.a) / q.b
+                continue
+            if self._form[i] == _LOGIT:
+                s = (x[:, i] - q.lower) / (q.upper - q.lower)
+            else:
+                s = np.log(np.maximum(x[:, i], q.lower) / q.lower) / math.log(q.upper / q.lower)
+            s = np.clip(s, 1e-9, 1.0 - 1e-9)
+            u[:, i] = np.log(s) - np.log1p(-s)
+        return u
+
+    def full(self, x: Array) -> Array:
+        """All declared parameters, shape (w, number declared), from the free ones, shape (w, d)."""
+        out = np.empty((len(x), len(self.template)))
+        out[:] = self.template
+        out[:, self.columns] = x
+        return out
+
+    def draw(self, rng: np.random.Generator, n: int) -> Array:
+        """Draws from the prior in natural units, shape (n, d)."""
+        return np.column_stack([q.draw(rng, n) for q in self.priors])
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """`` (did you mean 'x'?)``, or nothing."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+__all__ = ["UNIFORM", "Declared", "Prior", "Space", "declare", "suggestion"]
