@@ -215,9 +215,12 @@ class Parser:
         if len(buffer) < end:
             return None
         frame = bytes(buffer[:end])
-        del buffer[:end]
         if crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
+            # If the end was lost, the next header begins where the checksum should be.
+            header = buffer.find(_MARK, end - 4, end + 2)
+            del buffer[: header if header >= 0 else end]
             return Damaged(frame[4], frame[7])
+        del buffer[:end]
         body = unstuff(frame[7:-2])
         return Packet(frame[4], body[0], body[1:])
 
