@@ -1,7 +1,8 @@
 """One (term, cap) integral for each of many surface elements, by the rule of `gonio.integrate.cap`, order by order.
 
-The error of a value is its difference from the next lower order, which in the converging regime is the error of that
-lower order and so far above that of the value, plus the rounding of the sum.
+The error of a value is judged by how it differs from the two lower orders, plus the rounding of the sum. While the rule
+converges the last difference is the error of the lower order, far above that of the value; where the differences do not
+fall (an integrand with jumps or kinks), both count, twice.
 """
 
 from __future__ import annotations
@@ -100,20 +101,30 @@ def integrate_cap(
         symmetric = bool(axis[1] == 0.0) and term.model.isotropic
         cosine, sine = float(elements.cos_theta[k]), float(elements.sin_theta[k])
         frame = _Frame(cosine, sine, axis, cap.half_angle, local, width or _NO_LOBE, symmetric)
-        before = np.nan
+        totals: list[float] = []
         for order in ORDERS:
-            total, magnitude, nodes = _sum(term, cap, frame, order, scratch)
+            total, nodes = _sum(term, cap, frame, order, scratch)
             effort.add(nodes, order)
-            difference = abs(total - before)
-            before = total
-            rounding = 4.0 * EPS * magnitude * (1.0 + 1.0 / (width or 1.0))
-            if difference <= max(rtol * abs(total), atol) - rounding:
+            totals.append(total)
+            rounding = 4.0 * EPS * abs(total) * (1.0 + 1.0 / frame.width)
+            value[k], error[k] = total, _estimate(totals) + rounding
+            if error[k] <= max(rtol * abs(total), atol):
                 break
-        value[k], error[k] = total, difference + rounding
     return value, error
 
 
-def _sum(term: Term, cap: Cap, frame: _Frame, order: int, scratch: _Scratch) -> tuple[float, float, int]:
+def _estimate(totals: list[float]) -> float:
+    """Error of the last of a series of results of rising order."""
+    if len(totals) == 1:
+        return float("inf")
+    last = abs(totals[-1] - totals[-2])
+    if len(totals) == 2:
+        return 2.0 * last
+    before = abs(totals[-2] - totals[-3])
+    return max(last, 0.03 * before) if last < 0.1 * before else 2.0 * max(last, before)
+
+
+def _sum(term: Term, cap: Cap, frame: _Frame, order: int, scratch: _Scratch) -> tuple[float, int]:
     x, w = unit_rule(order)
     while (n := cap_nodes(*frame, x, w, scratch.directions, scratch.weights)) < 0:
         if scratch.weights.size >= _LARGEST:
@@ -126,5 +137,4 @@ def _sum(term: Term, cap: Cap, frame: _Frame, order: int, scratch: _Scratch) -> 
     accumulate(term.model)(directions, viewer, term.values, term.weight, f_r)
     if cap.profile is not None:
         f_r *= cap.profile(directions @ frame.axis)
-    total = cap.radiance * float(np.dot(weights, f_r))
-    return total, abs(total), n
+    return cap.radiance * float(np.dot(weights, f_r)), n
