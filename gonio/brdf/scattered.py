@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 MOST = 20_000  # more samples than this are averaged in cells first
 FEWEST = 12
 MISMATCH = 0.02  # relative error of a local polynomial that the weights allow for
+OUTSIDE = 4.0  # squared Mahalanobis distance from its neighbours beyond which a node is extrapolated
 TRIALS = 400  # samples left out, one at a time, to choose the settings
 
 
@@ -119,14 +120,17 @@ def regress(
 
     # outside its neighbours, or far from all of them: a straight line only, and an error that grows with the distance
     spacing = data.spacing(settings)
-    far = (local.outside > 6.0) | (local.nearest > 4.0 * spacing)
+    far = (local.outside > OUTSIDE) | (local.nearest > 4.0 * spacing)
     eta, sigma = local.eta.copy(), scale * local.sigma * np.sqrt(1.0 + (local.nearest / spacing) ** 2 / 4.0)
+    sigma *= _excess(data, settings, scale, targets)
     if np.any(far):
         straight = data.fit(targets[far], replace(settings, order=1, neighbours=max(settings.neighbours, 12)))
         eta[far] = straight.eta
         beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing / 4.0
-        sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, np.minimum(0.2 + 0.2 * beyond, 2.0))
-    eta, sigma = eta.reshape(shape), np.minimum(sigma, 3.0).reshape(shape)
+        sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, 0.2 + 0.3 * beyond)
+    # standard deviation of a log-normal value over its median's: what is badly known may be far above
+    sigma = np.minimum(sigma, 2.0)
+    eta, relative_u = eta.reshape(shape), np.sqrt(np.expm1(sigma**2)).reshape(shape)
     far = far.reshape(shape)
     value = np.exp(eta)
 
@@ -137,11 +141,10 @@ def regress(
     for edge in (np.index_exp[0, :, :], np.index_exp[:, 0, :]):
         touched = np.any(coverage[edge] == tabulated.MEASURED, axis=-1)
         coverage[edge][touched] = tabulated.MEASURED
-    relative_u = sigma
     if fill is not None:
         holes = far & (coverage != tabulated.MEASURED)
         value[holes] = fill.evaluate(node_i[holes], node_r[holes])
-        relative_u = np.where(holes, _misfit(fill, samples, known), sigma)
+        relative_u = np.where(holes, _misfit(fill, samples, known), relative_u)
         coverage[holes] = tabulated.MODEL
     coverage[below] = tabulated.BELOW_HORIZON
     attributes = {
@@ -287,7 +290,7 @@ def _choose(data: _Data) -> tuple[Settings, float]:
     _, local = residual(best)
     mu = np.exp(local.eta)
     deviation = np.abs(f - mu)
-    inside = local.outside < 6.0
+    inside = local.outside < OUTSIDE
     if np.count_nonzero(inside) < FEWEST:
         inside[:] = True
     low, high = 0.3, 30.0
@@ -299,6 +302,25 @@ def _choose(data: _Data) -> tuple[Settings, float]:
         else:
             high = middle
     return best, float(np.sqrt(low * high))
+
+
+def _excess(data: _Data, settings: Settings, scale: float, targets: Array) -> Array:
+    """Factor on the standard error at each target from the leave-one-out residuals around it.
+
+    Where the surface bends more than a local polynomial follows, the residuals of the samples there say so.
+    """
+    every = np.arange(len(data.f))
+    mu, sigma = np.empty(len(every)), np.empty(len(every))
+    for start in range(0, len(every), 2048):
+        part = every[start : start + 2048]
+        local = data.fit(data.x[part], settings, part)
+        mu[part], sigma[part] = np.exp(local.eta), local.sigma
+    noise = data.u if data.known else np.zeros_like(data.u)
+    pull2 = np.minimum((data.f - mu) ** 2 / (noise**2 + (scale * mu * sigma) ** 2 + 1e-300), 400.0)
+    tree, _ = data.tree(settings)
+    _, index = tree.query(data.metric(targets, settings), min(8, len(every)))  # type: ignore[attr-defined]
+    # shrunk towards 1 by four pseudo-residuals
+    return np.asarray(np.sqrt(np.maximum((pull2[index].sum(axis=1) + 4.0) / (index.shape[1] + 4.0), 1.0)))
 
 
 def _uncertainty(f: Array, u: Array) -> tuple[Array, bool]:

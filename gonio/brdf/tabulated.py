@@ -102,7 +102,7 @@ def _lobe_width(packed: Array) -> float:
     f = packed[3:].reshape(n_h, n_d, n_p) ** 4
     theta_h = 2.0 * np.arctan(np.linspace(0.0, 1.0, n_h) ** 2)
     width = 1.0
-    for j in range(0, n_d // 2):  # theta_d up to about 53 degrees: beyond, the horizon cuts the lobe
+    for j in range(n_d // 2):  # theta_d up to about 53 degrees: beyond, the horizon cuts the lobe
         column = f[:, j, n_p - 1]  # phi_d = 90 degrees: above the horizon at any theta_h
         peak, foot = float(column[0]), float(column[-1])
         if peak > 2.0 * foot:
@@ -232,8 +232,10 @@ class TabulatedBRDF:
         theta_i, theta_r = (np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]) for w in (wi, wr))
         phi_i, phi_r = (np.mod(np.arctan2(w[:, 1], w[:, 0]), 2 * np.pi) for w in (wi, wr))
         keep = (theta_i < np.pi / 2) & (theta_r < np.pi / 2)
-        arrays = (theta_i, phi_i, theta_r, phi_r, self.value[known], self.u[known])
-        return BRDFSamples.plain(*(array[keep] for array in arrays), attributes=dict(self.attributes))
+        return BRDFSamples.plain(
+            theta_i[keep], phi_i[keep], theta_r[keep], phi_r[keep], self.value[known][keep], self.u[known][keep],
+            attributes=dict(self.attributes),
+        )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
         """Write the table as NetCDF."""

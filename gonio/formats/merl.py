@@ -1,0 +1,173 @@
+"""MERL ``.binary``: an isotropic BRDF on 90 x 90 x 180 half and difference angles, three colour planes.
+
+Little-endian ``int32`` 90, 90, 180, then the planes red, green, blue of float64, each ordered theta_h, theta_d, phi_d
+(fastest). Bin k of theta_h begins at k^2/90 degrees, of theta_d and phi_d at k degrees; phi_d covers half a turn, as the
+other half is reciprocal. f_r [1/sr] = stored value times 1/1500, 1.15/1500, 1.66/1500. A negative value marks a direction
+pair below the horizon or one never measured.
+
+Written is the value at the lower edge of each bin: readers that interpolate take the edges for nodes, and readers that
+truncate are exact there. A bin whose edge is below the horizon, though part of it is above, holds the value at its centre
+or at its highest corner. gonio has one channel and writes it three times.
+
+References
+----------
+.. [1] W. Matusik, H. Pfister, M. Brand, L. McMillan, "A Data-Driven Reflectance Model", ACM TOG 22(3), 2003, and the
+   reading code distributed with the MERL BRDF database.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf.base import BRDF
+from gonio.errors import ConfigurationError, DatasetError
+from gonio.formats import files
+from gonio.halfdiff import directions
+from gonio.samples import BRDFSamples
+
+Array = NDArray[np.float64]
+SHAPE = (90, 90, 180)
+CELLS = 90 * 90 * 180
+SCALE = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
+CHANNELS: Mapping[str, tuple[float, float, float]] = {
+    "luminance": (0.2126, 0.7152, 0.0722),  # Rec. ITU-R BT.709, linear RGB
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}
+HEADER = np.array(SHAPE, dtype="<i4").tobytes()
+SIZE = 12 + 3 * CELLS * 8
+STEPS = (1, 4, 10)  # every bin of theta_h, every 4th of theta_d, every 10th of phi_d: up to 40 000 samples
+
+
+def sniff(head: bytes) -> bool:
+    """The three sizes open the file."""
+    return head[:12] == HEADER
+
+
+def read(path: Path, channel: str = "luminance") -> BRDFSamples:
+    """Samples at the lower bin edges, thinned by `STEPS`: neighbouring bins of a MERL file are interpolated anyway.
+
+    Parameters
+    ----------
+    path : Path
+    channel : str
+        Key of `CHANNELS`.
+
+    Returns
+    -------
+    BRDFSamples
+        Without uncertainty (NaN), which the format cannot hold.
+    """
+    weights = CHANNELS.get(channel)
+    if weights is None:
+        raise ConfigurationError(f"a MERL file has no channel {channel!r}; choose one of: {', '.join(CHANNELS)}")
+    planes = read_planes(path)
+    theta_h, theta_d, phi_d = edges()
+    take = np.ix_(*(np.arange(0, n, step) for n, step in zip(SHAPE, STEPS, strict=True)))
+    h, d, p = np.meshgrid(
+        *(axis[::step] for axis, step in zip((theta_h, theta_d, phi_d), STEPS, strict=True)), indexing="ij"
+    )
+    value, valid = np.zeros(h.shape), np.ones(h.shape, dtype=bool)
+    for plane, scale, weight in zip(planes, SCALE, weights, strict=True):
+        if weight:
+            stored = plane[take]
+            valid &= stored >= 0
+            value += weight * scale * stored
+    # at theta_h = 0 and theta_d = 0 all phi_d are one direction pair
+    valid[0, :, 1:] = False
+    valid[:, 0, 1:] = False
+    omega_i, omega_r = directions(h, np.zeros_like(h), d, p)
+    # bins whose edge lies below the horizon hold the value of another point of the bin
+    above = (omega_i[..., 2] > 1e-3) & (omega_r[..., 2] > 1e-3)
+    keep = valid & above
+    if not np.any(keep):
+        raise DatasetError(f"{path}: no value of channel {channel} is valid; the file holds no BRDF")
+    theta_i, theta_r = (np.arccos(np.clip(w[..., 2], -1, 1))[keep] for w in (omega_i, omega_r))
+    phi_i, phi_r = (np.mod(np.arctan2(w[..., 1], w[..., 0]), 2 * np.pi)[keep] for w in (omega_i, omega_r))
+    attributes = {
+        "quantity": "brdf",
+        "source_quantity": f"brdf, {channel} of linear RGB",
+        "source_format": "merl",
+        "n_missing": str(int(np.count_nonzero(above & ~(valid | _degenerate(h.shape))))),
+        "thinning": f"bins theta_h every {STEPS[0]}, theta_d every {STEPS[1]}, phi_d every {STEPS[2]}, at their lower edges",
+    }
+    return BRDFSamples.plain(theta_i, phi_i, theta_r, phi_r, value[keep], attributes=attributes)
+
+
+def read_planes(path: Path) -> Array:
+    """The stored values, shape (3, 90, 90, 180): red, green, blue; not scaled, negative where invalid."""
+    size = files.size_of(path)
+    head = files.head(path, 12)
+    sizes = [int(n) for n in np.frombuffer(head, dtype="<i4")] if len(head) == 12 else []
+    if head != HEADER:
+        raise DatasetError(f"{path} begins with the sizes {sizes}, a MERL file with {list(SHAPE)}; it is no MERL file")
+    if size != SIZE:
+        raise DatasetError(f"{path} has {size} bytes, a MERL file has {SIZE}; it is cut or damaged: fetch it again")
+    data = np.frombuffer(files.read_bytes(path), dtype="<f8", offset=12).astype(float)
+    if not np.all(np.isfinite(data)):
+        bad = int(np.flatnonzero(~np.isfinite(data))[0])
+        raise DatasetError(f"{path}: value {bad} of {data.size} is not finite; the file is damaged")
+    if float(np.abs(data).max()) > 1e12:
+        raise DatasetError(f"{path}: a value of {np.abs(data).max():g} is no reflectance; the file is damaged")
+    return data.reshape(3, *SHAPE)
+
+
+def edges() -> tuple[Array, Array, Array]:
+    """Lower bin edges of theta_h, theta_d and phi_d [rad]."""
+    k = np.arange(90.0)
+    return np.radians(k * k / 90.0), np.radians(k), np.radians(np.arange(180.0))
+
+
+def write(path: Path, brdf: BRDF) -> None:
+    """Write a BRDF, tabulated or not.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be written or the BRDF has values that are not finite.
+    """
+    values = sampled(brdf)
+    if not np.all(np.isfinite(values)):
+        raise DatasetError(f"{path}: the BRDF is not finite everywhere, so no MERL file can be made from it")
+    stored = np.concatenate([np.where(values >= 0, values / scale, -1.0).ravel() for scale in SCALE])
+
+    def put(temporary: Path) -> None:
+        temporary.write_bytes(HEADER + stored.astype("<f8").tobytes())
+
+    files.replace_atomically(path, put)
+
+
+def sampled(brdf: BRDF) -> Array:
+    """f_r [1/sr] for each bin, shape (90, 90, 180); -1 where a whole bin is below the horizon."""
+    theta_h, theta_d, phi_d = edges()
+    out = np.full(SHAPE, -1.0)
+    step_h = np.radians((2.0 * np.arange(90.0) + 1.0) / 90.0)  # bin widths of theta_h: ((k+1)^2 - k^2)/90 degrees
+    one = np.radians(1.0)
+    # the edge itself, then the centre, then the corner of the bin that stands highest above the horizon
+    lower = np.where(phi_d < np.pi / 2, one * (1 - 1e-9), 0.0)  # towards phi_d = 90 degrees both directions rise
+    places = ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.0, 0.0, -1.0))
+    for up_h, up_d, up_p in places:
+        for row in range(SHAPE[0]):
+            open_ = out[row] < 0
+            if not np.any(open_):
+                continue
+            d, p = np.nonzero(open_)
+            shift = lower[p] if up_p < 0 else up_p * one
+            h_angle = np.full(d.shape, theta_h[row] + up_h * step_h[row])
+            wi, wr = directions(h_angle, 0.0, theta_d[d] + up_d * one, phi_d[p] + shift)
+            above = (wi[:, 2] > 1e-12) & (wr[:, 2] > 1e-12)
+            if np.any(above):
+                out[row][d[above], p[above]] = brdf.evaluate(wi[above], wr[above])
+    return out
+
+
+def _degenerate(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    out = np.zeros(shape, dtype=bool)
+    out[0, :, 1:] = True
+    out[:, 0, 1:] = True
+    return out

@@ -1,0 +1,291 @@
+"""Samples and tables as self-describing NetCDF-4, CF style: any netCDF or HDF5 tool shows what they are.
+
+One root group. Samples have the dimension ``sample``: ``theta_i``, ``phi_i``, ``theta_r``, ``phi_r`` [rad], ``brdf``
+[sr-1] with ``brdf_standard_error``, and the derivatives with respect to each shared error. A table has the dimensions
+``theta_h``, ``theta_d``, ``phi_d``: ``brdf_table`` with its standard error and coverage flags. Either or both may be
+present. CF has no standard name for a BRDF, so ``long_name`` says it. Numbers come back bit for bit.
+
+Files from outside are read with their declared sizes checked first; links to other files, virtual and external storage
+are refused.
+
+References
+----------
+.. [1] CF Conventions 1.11, sections 3.3 to 3.5 (standard error modifier, flags).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import gonio
+from gonio.errors import DatasetError
+from gonio.formats import files
+from gonio.samples import BRDFSamples, SharedError
+
+if TYPE_CHECKING:
+    from gonio.brdf.tabulated import TabulatedBRDF
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+CONVENTIONS = "CF-1.11 gonio-1"
+LARGEST_ARRAY = 2**30  # bytes, as declared
+BRDF_NAME = "bidirectional reflectance distribution function"
+FRAME = (
+    "polar angles from the surface normal, azimuths counter-clockwise from the tangent; "
+    "mirror direction at phi_r = phi_i + pi; half and difference angles after Rusinkiewicz (1998)"
+)
+DIRECTIONS = {
+    "theta_i": "polar angle of incidence",
+    "phi_i": "azimuth of incidence",
+    "theta_r": "polar angle of reflection",
+    "phi_r": "azimuth of reflection",
+}
+
+
+def sniff(head: bytes) -> bool:
+    """The HDF5 signature."""
+    return head[:8] == SIGNATURE
+
+
+def write(
+    path: Path,
+    *,
+    samples: BRDFSamples | None = None,
+    table: TabulatedBRDF | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> None:
+    """Write samples, a table or both.
+
+    Parameters
+    ----------
+    path : Path
+    samples : BRDFSamples, optional
+    table : TabulatedBRDF, optional
+    attributes : mapping of str to str, optional
+        More about the file; ``history`` extends the file's own.
+    """
+    if samples is None and table is None:
+        raise DatasetError(f"{path}: there is neither a table nor a set of samples to write")
+
+    def put(temporary: Path) -> None:
+        import h5netcdf
+
+        with h5netcdf.File(temporary, "w") as file:
+            given = dict(attributes or {})
+            history = f"written by gonio {gonio.__version__}"
+            file.attrs["Conventions"] = CONVENTIONS
+            file.attrs["title"] = given.pop("title", BRDF_NAME)
+            file.attrs["history"] = "; ".join(text for text in (given.pop("history", ""), history) if text)
+            file.attrs["source"] = given.pop("source", f"gonio {gonio.__version__}")
+            file.attrs["references"] = "F. E. Nicodemus et al., NBS Monograph 160, 1977, doi:10.6028/NBS.MONO.160"
+            file.attrs["quantity"] = "brdf"
+            file.attrs["frame_convention"] = FRAME
+            file.attrs["uncertainty"] = "standard uncertainty (k = 1); errors shared by all samples are listed apart"
+            if given:
+                file.attrs["gonio_attributes"] = json.dumps(given, sort_keys=True)
+            if samples is not None:
+                _put_samples(file, samples)
+            if table is not None:
+                _put_table(file, table)
+
+    files.replace_atomically(path, put)
+
+
+def contents(path: Path) -> set[str]:
+    """What the file holds: ``"samples"``, ``"table"`` or both."""
+    with _opened(path) as file:
+        return {kind for kind, name in (("samples", "brdf"), ("table", "brdf_table")) if name in file}
+
+
+def read_samples(path: Path) -> BRDFSamples:
+    """Samples of a file that `write` made, or `DatasetError`."""
+    with _opened(path) as file:
+        _needed(path, file, "brdf", "samples")
+        arrays = {name: _array(path, file, name) for name in (*DIRECTIONS, "brdf", "brdf_standard_error")}
+        n = arrays["brdf"].shape[0] if arrays["brdf"].ndim == 1 else -1
+        for name, array in arrays.items():
+            if array.shape != (n,):
+                raise DatasetError(f"{path}: {name} has shape {array.shape}, brdf {arrays['brdf'].shape}; it is damaged")
+        shared: tuple[SharedError, ...] = ()
+        none = np.zeros((n, 3, 0))
+        d_omega_i, d_omega_r, d_ln_f = none, none, np.zeros((n, 0))
+        if "shared_error_u" in file:
+            u, u_sample = _array(path, file, "shared_error_u"), _array(path, file, "shared_error_u_sample")
+            names, units = _strings(path, file, "shared_error_name"), _strings(path, file, "shared_error_unit")
+            if not (u.ndim == 1 and u.shape == u_sample.shape and len(names) == len(units) == len(u)):
+                raise DatasetError(f"{path}: the shared errors have different lengths; the file is damaged")
+            shared = tuple(
+                SharedError(*row) for row in zip(names, u.tolist(), u_sample.tolist(), units, strict=True)
+            )
+            d_omega_i, d_omega_r = _array(path, file, "d_omega_i"), _array(path, file, "d_omega_r")
+            d_ln_f = _array(path, file, "d_ln_f")
+        pose = _array(path, file, "pose", kind="i") if "pose" in file else np.full(n, -1, dtype=np.int64)
+        attributes = _attributes(path, file["brdf"])
+    return BRDFSamples(
+        arrays["theta_i"], arrays["phi_i"], arrays["theta_r"], arrays["phi_r"], arrays["brdf"],
+        arrays["brdf_standard_error"], pose.astype(np.int64), shared, d_omega_i, d_omega_r, d_ln_f, attributes,
+    )  # fmt: skip
+
+
+def read_table(path: Path) -> TabulatedBRDF:
+    """Table of a file that `write` made, or `DatasetError`."""
+    from gonio.brdf import tabulated
+
+    with _opened(path) as file:
+        _needed(path, file, "brdf_table", "table")
+        value = _array(path, file, "brdf_table")
+        u = _array(path, file, "brdf_table_standard_error")
+        coverage = _array(path, file, "brdf_table_coverage", kind="iu")
+        tabulated.check_shape(value.shape)
+        for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape), strict=True):
+            axis = _array(path, file, name)
+            if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
+                raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
+        attributes = _attributes(path, file["brdf_table"])
+    if np.any((coverage < 0) | (coverage > 255)):
+        raise DatasetError(f"{path}: a coverage flag is outside 0 to 255; the file is damaged")
+    return tabulated.TabulatedBRDF(value, u, coverage.astype(np.uint8), attributes)
+
+
+def _put_samples(file: Any, samples: BRDFSamples) -> None:
+    file.dimensions["sample"] = len(samples)
+    for name, long_name in DIRECTIONS.items():
+        _variable(file, name, ("sample",), getattr(samples, name), long_name=long_name, units="rad")
+    _variable(
+        file, "brdf", ("sample",), samples.f_r, long_name=BRDF_NAME, units="sr-1", coordinates=" ".join(DIRECTIONS),
+        ancillary_variables="brdf_standard_error", gonio_attributes=json.dumps(dict(samples.attributes), sort_keys=True),
+    )  # fmt: skip
+    _variable(
+        file, "brdf_standard_error", ("sample",), samples.u_f_r, long_name=f"standard uncertainty of the {BRDF_NAME}",
+        units="sr-1", comment="random errors only, k = 1; NaN where unknown",
+    )  # fmt: skip
+    _variable(file, "pose", ("sample",), samples.pose, long_name="pose of the scan, -1 if none")
+    if samples.shared:
+        file.dimensions["shared_error"] = len(samples.shared)
+        file.dimensions["component"] = 3
+        for name, meaning in (("name", "name"), ("unit", "unit of the shared value")):
+            texts = [getattr(e, name) for e in samples.shared]
+            _texts(file, f"shared_error_{name}", ("shared_error",), texts, long_name=meaning)
+        u, u_sample = (np.array([getattr(e, n) for e in samples.shared]) for n in ("u", "u_sample"))
+        note = "in the unit that shared_error_unit gives"
+        _variable(file, "shared_error_u", ("shared_error",), u, long_name="standard uncertainty of the value", comment=note)
+        _variable(
+            file, "shared_error_u_sample", ("shared_error",), u_sample,
+            long_name="standard deviation of an independent error of the same kind in each sample", comment=note,
+        )  # fmt: skip
+        for name in ("d_omega_i", "d_omega_r"):
+            _variable(
+                file, name, ("sample", "component", "shared_error"), getattr(samples, name),
+                long_name="derivative of the unit vector in the local frame with respect to the shared error",
+            )  # fmt: skip
+        _variable(
+            file, "d_ln_f", ("sample", "shared_error"), samples.d_ln_f,
+            long_name="derivative of ln(brdf) with respect to the shared error, directions held",
+        )  # fmt: skip
+
+
+def _put_table(file: Any, table: TabulatedBRDF) -> None:
+    from gonio.brdf.tabulated import COVERAGE
+
+    dimensions = ("theta_h", "theta_d", "phi_d")
+    names = ("polar angle of the half vector", "polar angle of the difference vector", "azimuth of the difference vector")
+    for name, size in zip(dimensions, table.shape, strict=True):
+        file.dimensions[name] = size
+    for name, long_name, axis in zip(dimensions, names, table.nodes(), strict=True):
+        _variable(file, name, (name,), axis, long_name=f"{long_name} (Rusinkiewicz)", units="rad")
+    _variable(
+        file, "brdf_table", dimensions, table.value, long_name=BRDF_NAME, units="sr-1",
+        ancillary_variables="brdf_table_standard_error brdf_table_coverage",
+        comment="phi_d is folded into 0..pi/2: reciprocal and mirror-symmetric; beyond the horizon a continuation",
+        gonio_attributes=json.dumps(dict(table.attributes), sort_keys=True),
+    )  # fmt: skip
+    _variable(
+        file, "brdf_table_standard_error", dimensions, table.u, units="sr-1",
+        long_name=f"standard uncertainty of the {BRDF_NAME}", comment="k = 1; shared errors are not included",
+    )  # fmt: skip
+    _variable(
+        file, "brdf_table_coverage", dimensions, table.coverage, long_name="origin of the value",
+        flag_values=np.array(list(COVERAGE), dtype=np.uint8), flag_meanings=" ".join(COVERAGE.values()),
+    )  # fmt: skip
+
+
+def _variable(file: Any, name: str, dimensions: tuple[str, ...], data: np.ndarray, **attributes: Any) -> None:
+    variable = file.create_variable(name, dimensions, dtype=data.dtype, data=data)
+    for key, value in attributes.items():
+        variable.attrs[key] = value
+
+
+def _texts(file: Any, name: str, dimensions: tuple[str, ...], texts: list[str], **attributes: Any) -> None:
+    import h5py
+
+    variable = file.create_variable(name, dimensions, dtype=h5py.string_dtype())
+    variable[...] = np.array(texts, dtype=object)
+    for key, value in attributes.items():
+        variable.attrs[key] = value
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The file under h5py; whatever a damaged file makes the library raise becomes a `DatasetError`."""
+    files.size_of(path)
+    if not sniff(files.head(path, 8)):
+        raise DatasetError(f"{path} is no NetCDF-4 file: the HDF5 signature is missing")
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise DatasetError(f"{path} is a damaged NetCDF-4 file ({files.shown(str(error), 120)}); make it again") from error
+
+
+def _needed(path: Path, file: Any, name: str, kind: str) -> None:
+    if name not in file:
+        raise DatasetError(f"{path} holds no {kind} (variable {name}); make it with `gonio export` or `gonio table`")
+
+
+def _dataset(path: Path, file: Any, name: str) -> Any:
+    import h5py
+
+    _needed(path, file, name, name)
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise DatasetError(f"{path}: {name} is a link to another file, which is refused; copy the data into one file")
+    data = file[name]
+    if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
+        raise DatasetError(f"{path}: {name} is not stored in this file; copy the data into one file")
+    return data
+
+
+def _array(path: Path, file: Any, name: str, kind: str = "f") -> np.ndarray:
+    data = _dataset(path, file, name)
+    if data.dtype.kind not in kind or data.ndim > 3:
+        raise DatasetError(f"{path}: {name} has {data.ndim} dimensions of {data.dtype}, which gonio does not write")
+    declared = math.prod(int(n) for n in data.shape) * data.dtype.itemsize
+    if declared > LARGEST_ARRAY:
+        raise DatasetError(f"{path}: {name} declares {declared} bytes, at most {LARGEST_ARRAY} are read")
+    array = np.asarray(data[()])
+    return array.astype(float) if kind == "f" else array
+
+
+def _strings(path: Path, file: Any, name: str) -> list[str]:
+    data = _dataset(path, file, name)
+    if data.ndim != 1 or data.shape[0] > 1000 or data.dtype.kind not in "OS":
+        raise DatasetError(f"{path}: {name} is no list of names; the file is damaged")
+    return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in data[()]]
+
+
+def _attributes(path: Path, variable: Any) -> dict[str, str]:
+    text = variable.attrs.get("gonio_attributes", "{}")
+    try:
+        found = json.loads(str(text))
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: the attribute gonio_attributes is not JSON; the file is damaged") from error
+    if not isinstance(found, dict):
+        raise DatasetError(f"{path}: the attribute gonio_attributes is no mapping; the file is damaged")
+    return {str(name): str(value) for name, value in found.items()}
