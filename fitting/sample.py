@@ -1,0 +1,235 @@
+r"""Draws from a posterior by emcee: independent ensembles, checked at growing intervals, the same draws for the same seed.
+
+Moves are differential evolution [1]_, 0.9 with emcee's step and 0.1 with a full difference, which jumps between modes. The
+snooker move of emcee 3.1.6 is not used: it samples a distribution that is too narrow (emcee pull request 531).
+
+The ensembles share nothing but the likelihood, so that comparing them means something. Sampling ends when the chain kept
+after burn-in is longer than `Rule.taus` autocorrelation times, that time has settled, and the ensembles agree; or after
+`Rule.max_steps`, which is a status and not an error. No clock decides, so a seed gives the same bytes on a busy machine.
+
+References
+----------
+.. [1] C. J. F. ter Braak, "A Markov Chain Monte Carlo version of the genetic algorithm Differential Evolution", Statistics
+   and Computing 16, 2006; B. E. Nelson, E. B. Ford, M. J. Payne, ApJS 210:11, 2014.
+.. [2] D. Foreman-Mackey, D. W. Hogg, D. Lang, J. Goodman, "emcee: The MCMC Hammer", PASP 125, 2013.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitting.diagnostics import RHAT_LIMIT, autocorrelation_time, split_rhat
+from fitting.optimum import Mode
+from gonio.errors import ConvergenceError
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+_CHUNK = 100  # steps between two calls of the progress function
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How much to sample.
+
+    Attributes
+    ----------
+    ensembles : int
+        Independent ensembles; at least 2 are needed to compare them.
+    walkers : int, optional
+        Per ensemble; default max(32, 4 d). Even, and at least 2 d.
+    taus : float
+        Length of the kept chain in autocorrelation times.
+    burn_taus : float
+        Length of the burn-in in autocorrelation times.
+    drift : float
+        Largest relative change of the longest autocorrelation time since the last check.
+    first, growth : int, float
+        Steps at the first check, and the least ratio of one check to the next; at most 2, towards the length needed.
+    max_steps : int
+        Per ensemble.
+    """
+
+    ensembles: int = 4
+    walkers: int | None = None
+    taus: float = 50.0
+    burn_taus: float = 10.0
+    drift: float = 0.02
+    first: int = 200
+    growth: float = 1.15
+    max_steps: int = 6000
+
+
+@dataclass(frozen=True)
+class Chains:
+    """What sampling gave.
+
+    Attributes
+    ----------
+    u : ndarray, shape (ensemble, step, walker, d)
+        After burn-in, not thinned.
+    log_probability : ndarray, shape (ensemble, step, walker)
+    tau : ndarray, shape (d,)
+        Integrated autocorrelation time [steps].
+    rhat : ndarray, shape (d,)
+    acceptance : float
+    converged : bool
+    status : str
+        Why it stopped, in one sentence.
+    steps, burn_in : int
+        Per ensemble.
+    """
+
+    u: Array
+    log_probability: Array
+    tau: Array
+    rhat: Array
+    acceptance: float
+    converged: bool
+    status: str
+    steps: int
+    burn_in: int
+
+
+def moves() -> list[tuple[Any, float]]:
+    """The mixture of proposals: name no snooker here."""
+    import emcee
+
+    return [(emcee.moves.DEMove(), 0.9), (emcee.moves.DEMove(gamma0=1.0), 0.1)]
+
+
+def run(
+    log_probability: Callable[[Array], Array],
+    modes: Sequence[Mode],
+    *,
+    seed: int,
+    rule: Rule | None = None,
+    progress: Progress | None = None,
+) -> Chains:
+    """Sample a density, starting from its modes.
+
+    Parameters
+    ----------
+    log_probability : callable
+        (w, d) -> (w,); -inf where the density is zero, never NaN.
+    modes : sequence of Mode
+        Walkers start at each in proportion to its mass, spread by 0.5 to 1 times its Laplace covariance.
+    seed : int
+        Draws are a function of the seed.
+    rule : Rule, optional
+    progress : callable, optional
+        ``progress(done, total)`` with steps of all ensembles; the total is an estimate that may change.
+
+    Raises
+    ------
+    ConvergenceError
+        If no start has a finite density.
+    """
+    import emcee
+
+    rule = rule or Rule()
+    d = len(modes[0].u)
+    walkers = rule.walkers or max(32, 4 * d)
+    samplers, states = [], []
+    for sequence in np.random.SeedSequence(seed).spawn(rule.ensembles):
+        first, second = sequence.spawn(2)
+        states.append(_start(log_probability, modes, walkers, np.random.default_rng(first)))
+        sampler = emcee.EnsembleSampler(walkers, d, log_probability, moves=moves(), vectorize=True)
+        sampler.random_state = np.random.RandomState(np.random.MT19937(second)).get_state()
+        samplers.append(sampler)
+    fresh: list[Any] = list(states)
+    steps, target, total, before = 0, rule.first, rule.first, math.inf
+    while True:
+        target = min(rule.max_steps, max(target, math.ceil(steps * rule.growth)))
+        total = min(rule.max_steps, max(total, target))
+        for e, sampler in enumerate(samplers):
+            for a in range(steps, target, _CHUNK):
+                b = min(a + _CHUNK, target)
+                fresh[e] = sampler.run_mcmc(fresh[e], b - a, skip_initial_state_check=a > 0)
+                if progress is not None:
+                    progress(steps * rule.ensembles + e * (target - steps) + b - steps, total * rule.ensembles)
+        steps = target
+        chain = np.stack([s.get_chain() for s in samplers])  # (ensemble, step, walker, d)
+        tau, burn_in = _settle(chain, rule)
+        kept = chain[:, burn_in:]
+        rhat = split_rhat(kept[:, :: max(1, int(tau.max() / 2))].reshape(rule.ensembles, -1, d))
+        long_enough = kept.shape[1] > rule.taus * float(tau.max())
+        longest = float(tau.max())
+        moved, before = abs(longest - before) / longest, longest
+        agree = bool(np.all(rhat < RHAT_LIMIT))
+        total = math.ceil(1.05 * (rule.taus + rule.burn_taus) * longest)
+        target = min(total, 2 * steps)
+        if (long_enough and moved < rule.drift and agree) or steps >= rule.max_steps:
+            break
+    converged = long_enough and moved < rule.drift and agree
+    if progress is not None:
+        progress(steps * rule.ensembles, steps * rule.ensembles)
+    return Chains(
+        u=kept,
+        log_probability=np.stack([s.get_log_prob() for s in samplers])[:, burn_in:],
+        tau=tau,
+        rhat=rhat,
+        acceptance=float(np.mean([s.acceptance_fraction for s in samplers])),
+        converged=converged,
+        status=_status(converged, kept.shape[1], tau, moved, rhat, rule),
+        steps=steps,
+        burn_in=burn_in,
+    )
+
+
+def _settle(chain: Array, rule: Rule) -> tuple[Array, int]:
+    """Autocorrelation time and burn-in that agree: `burn_taus` tau are left out, at most half the chain."""
+    _, steps, _, d = chain.shape
+    burn_in = steps // 2
+    for _ in range(3):
+        tau = autocorrelation_time(chain[:, burn_in:].transpose(1, 0, 2, 3).reshape(steps - burn_in, -1, d))
+        wanted = min(steps // 2, math.ceil(rule.burn_taus * float(tau.max())))
+        if wanted == burn_in:
+            break
+        burn_in = wanted
+    return tau, burn_in
+
+
+def _start(
+    log_probability: Callable[[Array], Array], modes: Sequence[Mode], walkers: int, rng: np.random.Generator
+) -> Array:
+    """Walkers around the modes, all with a finite density, shape (walkers, d)."""
+    d = len(modes[0].u)
+    mass = np.array([m.log_mass for m in modes])
+    share = np.exp(mass - mass.max())
+    factors = [np.linalg.cholesky(m.covariance + 1e-14 * np.eye(d) * np.trace(m.covariance)) for m in modes]
+    out = np.empty((walkers, d))
+    missing = np.arange(walkers)
+    for trial in range(100):
+        pick = rng.choice(len(modes), size=len(missing), p=share / share.sum())
+        spread = rng.uniform(0.5, 1.0) * 0.9**trial  # smaller and smaller, into the support
+        z = rng.standard_normal((len(missing), d)) * math.sqrt(spread)
+        out[missing] = [modes[i].u + factors[i] @ v for i, v in zip(pick, z, strict=True)]
+        missing = missing[~np.isfinite(log_probability(out[missing]))]
+        if len(missing) == 0:
+            return out
+    raise ConvergenceError(
+        f"{len(missing)} of {walkers} walkers find no start with a finite probability around the optimum; "
+        "check the priors against the data"
+    )
+
+
+def _status(converged: bool, kept: int, tau: Array, moved: float, rhat: Array, rule: Rule) -> str:
+    longest, worst = float(tau.max()), float(np.max(rhat)) if np.all(np.isfinite(rhat)) else math.nan
+    numbers = f"{kept} steps kept, longest autocorrelation time {longest:.1f} steps, R-hat {worst:.4f}"
+    if converged:
+        return f"converged: {numbers}"
+    reasons = []
+    if not kept > rule.taus * longest:
+        needed = rule.taus * longest
+        reasons.append(f"the chain should be longer than {rule.taus:g} autocorrelation times ({needed:.0f} steps)")
+    if not moved < rule.drift:
+        reasons.append(f"the autocorrelation time still moved by {moved:.1%}")
+    if not worst < RHAT_LIMIT:
+        reasons.append(f"the ensembles disagree (R-hat should be below {RHAT_LIMIT})")
+    return f"not converged: {numbers}; {'; '.join(reasons)}; raise max_steps (now {rule.max_steps}) or fix a parameter"
