@@ -174,8 +174,8 @@ class CameraLink:
         return (_CameraConnection(self._camera, self._clock, client),)
 
     def due(self) -> float | None:
-        """Never; exposures belong to the connections."""
-        return time.monotonic() if self._camera.unplugged else None
+        """Never, but at once when the camera was unplugged; exposures belong to the connections."""
+        return 0.0 if self._camera.unplugged else None
 
     def on_due(self) -> None:
         """The camera was unplugged."""
@@ -197,6 +197,7 @@ class _CameraConnection:
         self._parser = MessageParser()
         self._requests: deque[dict[str, Any]] = deque()
         self._unsent = memoryview(b"")
+        self._retry_at = 0.0
         self._then: Callable[[], None] | None = None  # next step of a running exposure
         self._then_due = 0.0
         self._lost = False
@@ -224,9 +225,9 @@ class _CameraConnection:
 
     def due(self) -> float | None:
         if self._lost:
-            return time.monotonic()
+            return 0.0
         if len(self._unsent):
-            return time.monotonic() + 0.001
+            return self._retry_at
         return None if self._then is None else self._then_due
 
     def on_due(self) -> None:
@@ -304,7 +305,7 @@ class _CameraConnection:
             try:
                 self._unsent = self._unsent[self._socket.send(self._unsent) :]
             except BlockingIOError:
-                return
+                self._retry_at = time.monotonic() + 0.001
             except OSError:
                 self._lose()
 
@@ -322,7 +323,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(argv: Sequence[str] | None = None, *, announce: Callable[[str], None] | None = None) -> int:
-    """Serve a simulated rig until SIGTERM, SIGINT, SIGHUP or, with ``--parent``, the end of standard input.
+    """Serve a simulated rig until SIGTERM, SIGINT or SIGHUP, or, with ``--parent``, SIGTERM or the end of standard input.
 
     Parameters
     ----------
@@ -354,7 +355,7 @@ def serve(argv: Sequence[str] | None = None, *, announce: Callable[[str], None] 
     simulation.warm_up()
 
     stop = threading.Event()
-    previous = _stop_on_signals(stop)
+    previous = _stop_on_signals(stop, options.parent)
     pump = Pump()
     try:
         bus = _line(pump, simulation.bus, simulated, options.pty)
@@ -407,11 +408,15 @@ def _line(pump: Pump, device: Device, clock: ScaledClock, name: Path | None) -> 
     return terminal.path
 
 
-def _stop_on_signals(stop: threading.Event) -> dict[int, Any]:
-    """Stop on signals, if this is the main thread; return the handlers that were there."""
+def _stop_on_signals(stop: threading.Event, has_parent: bool) -> dict[int, Any]:
+    """Stop on signals, if this is the main thread; return the handlers that were there.
+
+    Ctrl-C in a terminal reaches parent and child; the parent still has to stop the axes then, so a child goes on.
+    """
 
     def handler(number: int, frame: FrameType | None) -> None:
-        stop.set()
+        if not has_parent or number == signal.SIGTERM:
+            stop.set()
 
     previous: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
