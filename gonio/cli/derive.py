@@ -1,0 +1,92 @@
+"""gonio reduce, table, fit, report: what is derived from a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from gonio.cli import steps
+from gonio.cli.output import json_option, speaking
+from gonio.errors import ConfigurationError, ConvergenceError
+
+RUN = click.argument("run", type=click.Path(path_type=Path))
+
+
+@click.command()
+@RUN
+@json_option
+def reduce(run: Path, as_json: bool) -> None:
+    """Turn the frames of RUN into BRDF samples, each with its random and its shared uncertainties."""
+    with speaking(as_json) as output, steps.open_run(run) as opened:
+        samples = steps.reduce_run(opened, output)
+        output.say(f"{len(samples)} samples of f_r in 1/sr; shared errors: {', '.join(e.name for e in samples.shared)}")
+
+
+@click.command()
+@RUN
+@click.option("--fill", is_flag=True, help="Fill what was not measured from the fit; those nodes are flagged.")
+@json_option
+def table(run: Path, fill: bool, as_json: bool) -> None:
+    """Tabulate the samples of RUN over half and difference angles (table.nc)."""
+    with speaking(as_json) as output, steps.open_run(run) as opened:
+        made = steps.tabulate(opened, output, fill=steps.load_posterior(opened).brdf() if fill else None)
+        output.say(f"wrote {opened.table_path}: " + ", ".join(f"{n} nodes {k}" for k, n in made.counts().items()))
+
+
+@click.command()
+@RUN
+@click.option("--model", help="Sum of models, such as lambertian+ggx.")
+@click.option("--config", type=click.Path(path_type=Path, dir_okay=False), help="A fit.toml.")
+@click.option("--free", multiple=True, metavar="NAME", help="Free a parameter that its model holds, e.g. ggx.k_s.")
+@click.option("--fix", multiple=True, metavar="NAME=VALUE", help="Hold a parameter.")
+@click.option("--seed", type=int, help="Of the sampler; 1 by default.")
+@json_option
+def fit(
+    run: Path,
+    model: str | None,
+    config: Path | None,
+    free: tuple[str, ...],
+    fix: tuple[str, ...],
+    seed: int | None,
+    as_json: bool,
+) -> None:
+    """Fit a model to the samples of RUN with MCMC (posterior.nc); exit code 5 if the chains did not converge."""
+    from gonio.config import load_fit
+
+    chosen = load_fit(config) if config is not None else None
+    model = model or (chosen.model if chosen else None)
+    if model is None:
+        raise ConfigurationError("no model: give --model lambertian+ggx or --config fit.toml")
+    held = dict(chosen.fix) if chosen else {}
+    for item in fix:
+        name, separator, value = item.partition("=")
+        try:
+            held[name] = float(value)
+        except ValueError:
+            separator = ""
+        if not separator:
+            raise ConfigurationError(f"--fix {item}: write it as --fix NAME=VALUE, for example --fix ggx.f_0=0.04")
+    options: dict[str, object] = {"free": tuple(free) + (chosen.free if chosen else ()), "fix": held}
+    if chosen and chosen.priors:
+        options["priors"] = dict(chosen.priors)
+    if chosen and chosen.max_steps:
+        options["max_steps"] = chosen.max_steps
+    if seed is None:
+        seed = chosen.seed if chosen else 1
+    with speaking(as_json) as output, steps.open_run(run) as opened:
+        posterior = steps.fit(opened, output, model, seed, **options)
+        steps.show_fit(output, posterior)
+        if not posterior.diagnostics.get("converged"):
+            output.finish()
+            output.as_json = False  # printed already
+            raise ConvergenceError(steps.describe_convergence(posterior))
+
+
+@click.command()
+@RUN
+@json_option
+def report(run: Path, as_json: bool) -> None:
+    """Write report.html, report.json and figures/ of RUN from what it has: samples, table, fit, maps."""
+    with speaking(as_json) as output, steps.open_run(run) as opened:
+        steps.report(opened, output)

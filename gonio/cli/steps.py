@@ -1,0 +1,255 @@
+"""The steps from a run to its products, each used by its own verb and by the demo."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gonio.cli.output import Output, log_to
+from gonio.errors import DatasetError
+
+if TYPE_CHECKING:
+    from gonio.brdf.base import BRDF
+    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.config import SceneConfig
+    from gonio.integrate import MapValues
+    from gonio.maps import ReflectanceMap
+    from gonio.posterior import Posterior
+    from gonio.samples import BRDFSamples
+    from gonio.scan import Run
+    from gonio.source import Source
+
+log = logging.getLogger("gonio")
+BAND_DRAWS = 200
+
+
+def open_run(path: Path) -> Run:
+    """Open a run and send the log to it."""
+    from gonio.scan import Run
+
+    run = Run.open(path)
+    log_to(run.log_path)
+    return run
+
+
+def reduce_run(run: Run, output: Output) -> BRDFSamples:
+    """Frames of a scan to samples, stored in the run."""
+    from gonio.config import parse_rig
+    from gonio.radiometry import reduce_run as reduction
+
+    if run.kind != "scan":
+        raise DatasetError(f"{run.path} was imported: it has samples already and no frames to reduce")
+    rig = parse_rig(run.document("rig.toml"), f"{run.path}: rig.toml")
+    with output.stage("reduce frames") as progress:
+        samples = reduction(run, rig, lambda _, done, total: progress(done, total))
+        run.write_samples(samples)
+    log.info("reduced to %d samples", len(samples))
+    output.result(samples=len(samples), shared_errors={error.name: error.u for error in samples.shared})
+    return samples
+
+
+def tabulate(run: Run, output: Output, *, fill: BRDF | None = None) -> TabulatedBRDF:
+    """Samples to a table, written as table.nc."""
+    from gonio.brdf.tabulated import tabulate as make_table
+
+    with output.stage("tabulate") as progress:
+        table = make_table(run.read_samples(), fill=fill, progress=progress)
+        table.save(run.table_path)
+    output.result(table=run.table_path, coverage=table.counts())
+    return table
+
+
+def load_table(run: Run) -> TabulatedBRDF:
+    """The table of a run."""
+    from gonio.brdf.tabulated import TabulatedBRDF
+
+    if not run.table_path.exists():
+        raise DatasetError(f"{run.path} has no table yet; make it with: gonio table {run.path}")
+    return TabulatedBRDF.load(run.table_path)
+
+
+def load_posterior(run: Run) -> Posterior:
+    """The fit of a run."""
+    from gonio.posterior import Posterior
+
+    if not run.posterior_path.exists():
+        raise DatasetError(f"{run.path} has no fit yet; make it with: gonio fit {run.path} --model lambertian+ggx")
+    return Posterior.load(run.posterior_path)
+
+
+def fit(run: Run, output: Output, model: str, seed: int, **options: Any) -> Posterior:
+    """Samples to a posterior, written as posterior.nc."""
+    from fitting import fit as run_fit
+
+    with output.stage("fit") as progress:
+        posterior = run_fit(run.read_samples(), model, seed=seed, progress=progress, **options)
+        posterior.save(run.posterior_path)
+    status = posterior.diagnostics
+    log.info("fit %s: %s", model, {k: v for k, v in status.items() if isinstance(v, str | bool | int | float)})
+    output.result(
+        converged=bool(status.get("converged")),
+        parameters=posterior.summary(),
+        fixed=dict(posterior.fixed),
+        diagnostics=dict(status),
+        posterior=run.posterior_path,
+    )
+    return posterior
+
+
+def show_fit(output: Output, posterior: Posterior, truth: Mapping[str, float] | None = None) -> None:
+    """Table of the parameters, with the truth where it is known, and whether the chains converged."""
+    header = ["parameter", *(["truth"] if truth is not None else []), "median", "68 % from", "to", "95 % from", "to"]
+    rows = []
+    for name, s in posterior.summary().items():
+        numbers = [f"{s[key]:.5g}" for key in ("median", "q16", "q84", "q025", "q975")]
+        known = [f"{truth[name]:.5g}" if name in truth else ""] if truth is not None else []
+        rows.append([name, *known, *numbers])
+    output.table(f"Fit of {posterior.model}", header, rows)
+    output.say(describe_convergence(posterior))
+
+
+def describe_convergence(posterior: Posterior) -> str:
+    """One sentence on tau, ESS, R-hat and chi2/N."""
+    import numpy as np
+
+    d = posterior.diagnostics
+    state = "converged" if d.get("converged") else "NOT CONVERGED"
+
+    def worst(key: str, pick: Any) -> str:
+        value = d.get(key)
+        if value is None:
+            return "?"
+        items = list(value.values()) if isinstance(value, Mapping) else np.atleast_1d(np.asarray(value, dtype=float))
+        return f"{float(pick(items)):.4g}"
+
+    text = (
+        f"{state}: autocorrelation time up to {worst('tau', max)}, effective sample size at least {worst('ess', min)}, "
+        f"R-hat up to {worst('rhat', max)}; chi2/N = {worst('chi2_per_n', max)}"
+    )
+    advice = d.get("advice")
+    if advice:
+        text += ". " + (advice if isinstance(advice, str) else " ".join(advice))
+    return text
+
+
+def scene_brdf(scene: SceneConfig, folder: Path) -> tuple[BRDF, Posterior | None, dict[str, str]]:
+    """The BRDF of a scene, the posterior it comes from if any, and where it is from."""
+    config = scene.brdf
+    if config.run is None:
+        brdf = config.build()
+        return brdf, None, {"brdf": repr(brdf)}
+    path = Path(config.run)
+    if not path.is_absolute() and not path.exists():
+        path = folder / path
+    with open_run(path) as run:
+        if config.use == "table":
+            return load_table(run).brdf(), None, {"brdf": f"table of {path}"}
+        posterior = load_posterior(run)
+    return posterior.brdf(), posterior, {"brdf": f"fit of {path}: {posterior.brdf()!r}"}
+
+
+def scene_source(scene: SceneConfig) -> Source:
+    """The sum of the scene's sources."""
+    made = [config.build() for config in scene.sources]
+    total = made[0]
+    for source in made[1:]:
+        total = total + source
+    return total
+
+
+def compute_map(
+    output: Output,
+    title: str,
+    brdf: BRDF,
+    source: Source,
+    *,
+    p: Sequence[float],
+    q: Sequence[float],
+    n: int,
+    rtol: float,
+    posterior: Posterior | None = None,
+    attributes: Mapping[str, str] | None = None,
+) -> tuple[ReflectanceMap, MapValues]:
+    """A map with its band, if there is a posterior; a tolerance that is not met is told, not hidden."""
+    import numpy as np
+
+    from gonio import maps
+
+    draws = []
+    if posterior is not None:
+        chosen = posterior.thin(BAND_DRAWS, np.random.default_rng(0))
+        draws = [posterior.brdf(values) for values in chosen]
+    with output.stage(title) as progress:
+        made, values = maps.compute(
+            brdf,
+            source,
+            np.linspace(p[0], p[1], n),
+            np.linspace(q[0], q[1], n),
+            rtol=rtol,
+            draws=draws,
+            attributes={"source": repr(source), "rtol": f"{rtol:g}", **(attributes or {})},
+            progress=lambda done: progress(done, len(draws)),
+            tolerant=True,
+        )
+    worst = float(np.max(made.error - np.maximum(rtol * np.abs(made.value), 1e-13 * np.max(np.abs(made.value)))))
+    if worst > 0:
+        where = made.value > 1e-6 * made.value.max()
+        reached = float(np.max(made.error[where] / made.value[where])) if where.any() else float("nan")
+        output.warn(f"{title}: the integration reached a relative error of {reached:.1e} where {rtol:.0e} was asked for")
+    return made, values
+
+
+def export(run: Run, name: str, path: Path, output: Output) -> None:
+    """Write the data set of a run in one format."""
+    from gonio import formats
+
+    samples = run.read_samples() if run.has_samples() else None
+    table = load_table(run) if run.table_path.exists() else None
+    posterior = load_posterior(run) if run.posterior_path.exists() else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    formats.export(
+        name,
+        path,
+        samples=samples,
+        table=table,
+        brdf=None if posterior is None else posterior.brdf(),
+        attributes={"run": run.path.name},
+    )
+    output.say(f"wrote {path}: f_r in 1/sr, {formats.FORMATS[name].doc}")
+    output.result(file=path, format=name, quantity="brdf")
+
+
+def report(
+    run: Run,
+    output: Output,
+    *,
+    maps: Mapping[str, ReflectanceMap] | None = None,
+    truth: Mapping[str, float] | None = None,
+    warnings: Sequence[str] = (),
+) -> Path:
+    """Plots and report.html of whatever the run has."""
+    from gonio import report as reporting
+    from gonio.maps import ReflectanceMap
+
+    if maps is None:
+        maps = {file.stem: ReflectanceMap.load(file) for file in sorted(run.path.glob("map*.nc"))}
+    with output.stage("report") as progress:
+        attributes = {k: v for k, v in run.attributes.items() if k not in ("kind",)}
+        path = reporting.build(
+            run.path,
+            title=f"gonio report: {run.path.name}",
+            samples=run.read_samples() if run.has_samples() else None,
+            table=load_table(run) if run.table_path.exists() else None,
+            posterior=load_posterior(run) if run.posterior_path.exists() else None,
+            maps=maps,
+            truth=truth,
+            attributes=attributes,
+            warnings=warnings,
+            documents=run.documents,
+            progress=progress,
+        )
+    output.say(f"wrote {path}")
+    output.result(report=path)
+    return path
