@@ -118,7 +118,7 @@ class Settings:
     lamp_intensity: float = 1.0
     beta: float = 0.99
     u_beta: float = 0.005
-    speed: float = 40.0
+    speed: float = 1.0
     seed: int = 1
     truth: Mapping[str, Any] = field(default_factory=dict)
 
@@ -178,7 +178,7 @@ class Settings:
             truth.number("lamp_intensity", 1.0, 0.0, 1e6),
             white.number("beta", 0.99, 1e-6, 10.0),
             white.number("u_beta", 0.005, 0.0, 1.0),
-            sim.number("speed", 40.0, 1e-3, 1e4),
+            sim.number("speed", 1.0, 1e-3, 1e4),
             sim.integer("seed", 1, 0, 2**63 - 1),
             truth.values,
         )
