@@ -54,6 +54,7 @@ logger = logging.getLogger(__name__)
 
 _FENCE_LENGTHS = (8, 9, 10, 11, 12)  # from address 0; all hold the id, none is the length of another answer
 _DRAIN_LIMIT_S = 5.0
+_HASTY_TIMEOUT_S = 0.05  # above the latency of a USB adapter, there and back
 _STATUS_CRC = 3
 _MOTION_SLACK_COUNTS = 4.0
 _TOP_SPEED_COUNTS_S = 8000.0  # 117 rev/min, beyond every X-series servo
@@ -201,10 +202,10 @@ class Bus:
         self._refuse(servo_id, f"reading {register.name}", error)
         return register.decode(data)
 
-    def write(self, servo_id: int, register: Register, value: int) -> bool:
+    def write(self, servo_id: int, register: Register, value: int, *, hasty: bool = False) -> bool:
         """Write a register and wait for the acknowledgement; True if the servo raises its alert bit."""
         parameters = register.address.to_bytes(2, "little") + register.encode(value)
-        _, error = self._ask(servo_id, INST_WRITE, parameters, 0)
+        _, error = self._ask(servo_id, INST_WRITE, parameters, 0, hasty=hasty)
         self._refuse(servo_id, f"{register.name} = {value}", error)
         return bool(error & 0x80)
 
@@ -218,11 +219,11 @@ class Bus:
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque goes off, RAM registers fall back to their defaults."""
-        self._ask(servo_id, INST_REBOOT, b"", 0, attempts=1)
+        self._ask(servo_id, INST_REBOOT, b"", 0)
 
     # -- state
 
-    def block(self, servo_id: int, *, attempts: int | None = None) -> Block:
+    def block(self, servo_id: int, *, hasty: bool = False) -> Block:
         """State of a servo now."""
         parameters = BLOCK_ADDRESS.to_bytes(2, "little") + BLOCK_SIZE.to_bytes(2, "little")
         sent_s = 0.0
@@ -231,7 +232,7 @@ class Bus:
             nonlocal sent_s
             sent_s = self.clock.now()
 
-        data, error = self._ask(servo_id, INST_READ, parameters, BLOCK_SIZE, attempts=attempts, started=started)
+        data, error = self._ask(servo_id, INST_READ, parameters, BLOCK_SIZE, hasty=hasty, started=started)
         received_s = self.clock.now()
         self._refuse(servo_id, "reading its state", error)
         block = decode_block(data, alert=bool(error & 0x80), sent_s=sent_s, received_s=received_s)
@@ -272,9 +273,9 @@ class Bus:
     def stop_all(self) -> None:
         """Stop every registered servo now and hold: goal := present, torque stays on.
 
-        Call it from ordinary code, never from a signal handler. The first pass gives each servo one try, those that
-        answered last time first, and stops it at once; a second pass insists. A servo that does not answer is sent the
-        last position seen, which lies on the path behind it.
+        Call it from ordinary code, never from a signal handler. A first pass gives each servo one short try and stops
+        it at once, so that a silent one does not keep the others moving; a second pass insists. A servo that does not
+        answer is sent the last position seen, which lies on the path behind it.
 
         Raises
         ------
@@ -284,8 +285,8 @@ class Bus:
         with self._lock:
             self._port.is_using = False
             order = sorted(self._members, key=lambda servo_id: servo_id in self._failing)
-            late = [servo_id for servo_id in order if not self._stop(servo_id, attempts=1)]
-            unreached = [servo_id for servo_id in late if not self._stop(servo_id, attempts=self.attempts)]
+            late = [servo_id for servo_id in order if not self._stop(servo_id, hasty=True)]
+            unreached = [servo_id for servo_id in late if not self._stop(servo_id, hasty=False)]
         if unreached:
             names = " and ".join(self.label(servo_id) for servo_id in unreached)
             raise DeviceTimeoutError(
@@ -293,12 +294,16 @@ class Bus:
                 "cut the power of the servos if anything moves."
             )
 
-    def _stop(self, servo_id: int, *, attempts: int) -> bool:
+    def _stop(self, servo_id: int, *, hasty: bool) -> bool:
         """Tell one servo to hold where it is; True if it said that it does."""
         member = self._members[servo_id]
         try:
-            goal = member.clip(self.block(servo_id, attempts=attempts).position)
-            self.write(servo_id, GOAL_POSITION, goal)
+            if not hasty:  # a hasty question may still be answered
+                self._port.timeout_s = self.timeout_s
+                self._drain()
+                self._fence(servo_id)
+            goal = member.clip(self.block(servo_id, hasty=hasty).position)
+            self.write(servo_id, GOAL_POSITION, goal, hasty=hasty)
         except DeviceError as error:
             logger.warning("stop: %s", error)
             if servo_id in self._last:
@@ -318,12 +323,16 @@ class Bus:
         parameters: bytes,
         length: int,
         *,
-        attempts: int | None = None,
+        hasty: bool = False,
         started: Callable[[], None] = lambda: None,
     ) -> tuple[bytes, int]:
-        """One instruction and its status: data of `length` bytes (or none with an error number), error byte."""
-        allowed = self.attempts if attempts is None else attempts
+        """One instruction and its status: data of `length` bytes (or none with an error number), error byte.
+
+        A hasty one has a single short try and leaves the line as it is.
+        """
+        allowed = 1 if hasty else self.attempts
         with self._lock:
+            self._port.timeout_s = min(self.timeout_s, _HASTY_TIMEOUT_S) if hasty else self.timeout_s
             for attempt in range(1, allowed + 1):
                 started()
                 result, data, error = self._exchange(servo_id, instruction, parameters, length)
@@ -336,6 +345,8 @@ class Bus:
                     continue
                 self.timeouts += 1
                 logger.info("%s: no valid answer (%d), try %d", self.label(servo_id), result, attempt)
+                if hasty:
+                    break
                 self._drain()
                 if attempt < allowed and not self._fence(servo_id):
                     break
@@ -417,6 +428,6 @@ class Bus:
                 "check the cable and that no two servos share the id."
             )
         return DeviceTimeoutError(
-            f"{self.label(servo_id)} does not answer within {self.timeout_s:g} s at {self.baud} baud; "
+            f"{self.label(servo_id)} gives no answer within {self._port.timeout_s:g} s at {self.baud} baud; "
             "check its power, cable, id and baud rate."
         )

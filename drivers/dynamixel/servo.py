@@ -230,7 +230,7 @@ class Servo:
             return
         legs = self._plan(goal, self._healthy(self._bus.block(self._id)))
         if self._watchdog:
-            self._write(reg.BUS_WATCHDOG, 0)
+            self._disarm()
             self._write(reg.BUS_WATCHDOG, self._watchdog)
         self._begin(legs)
         self._write(reg.GOAL_POSITION, legs[0])
@@ -301,8 +301,18 @@ class Servo:
         self._arrived = True
         self._engaged = self._one_sided
         if self._watchdog:
-            self._write(reg.BUS_WATCHDOG, 0)
+            self._disarm()
         return True
+
+    def _disarm(self) -> None:
+        """Watchdog off. One that has tripped takes the profile with it: without it the next move would be a jerk."""
+        if self._read(reg.BUS_WATCHDOG) < 0:
+            logger.warning("axis %s: the servo's watchdog had tripped", self._name)
+            self._write(reg.BUS_WATCHDOG, 0)
+            self._write(reg.PROFILE_ACCELERATION, self._settings.profile_acceleration)
+            self._write(reg.PROFILE_VELOCITY, self._settings.profile_velocity)
+        else:
+            self._write(reg.BUS_WATCHDOG, 0)
 
     def _resend(self, block: reg.Block) -> None:
         """The servo holds another goal than the one it acknowledged."""
@@ -326,6 +336,8 @@ class Servo:
         tripped = bool(self._watchdog) and self._read(reg.BUS_WATCHDOG) == -1
         current = self._current_a(block)
         try:
+            if tripped:  # it takes no goal before
+                self._disarm()
             self.stop()
         except DeviceError as error:
             logger.warning("axis %s: cannot be stopped after its stall: %s", self._name, error)
@@ -389,7 +401,7 @@ class Servo:
     def close(self) -> None:
         """Let go of the servo; it keeps its torque and holds."""
         if self._connected and self._watchdog:
-            self._write(reg.BUS_WATCHDOG, 0)
+            self._disarm()
         self._connected = False
 
     # -- drivers.dynamixel.bus.Member
