@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output is gone
         Output.close_stdout()
         return 0
-    except Exception as exc:  # noqa: BLE001  the last line of defence: no traceback at the command line
+    except Exception as exc:
         if debug:
             raise
         sentence = f"{type(exc).__name__}: {exc}. This is a defect of gonio; `gonio --debug ...` shows where it happened"
