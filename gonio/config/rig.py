@@ -17,6 +17,7 @@ from gonio.config.reader import Document, Table, read_document
 AXES = ("arm", "pan", "tilt")
 COUNTS_PER_TURN = 4096
 SIMULATED = "sim"
+BACKENDS = ("v4l2", "dshow", "msmf", "avfoundation", "ffmpeg", "images")
 MODELS = ("XM430-W350", "XL430-W250", "XL330-M288")
 
 
@@ -86,8 +87,10 @@ class CameraConfig:
     width, height, bit_depth, saturation_dn : int
     gain_dn_per_e, read_noise_e, offset_dn : float
         EMVA 1288 noise model: counts per electron, read noise [e], black level [DN].
-    device, backend, pixel_format, discard
-        For ``"opencv"``: device number or path, backend name, FourCC code, frames thrown away before each that counts.
+    device, backend, fourcc, gain, linear, channel, stale_frames, fixed
+        For ``"opencv"``: device number or path, backend by name, pixel format and gain to ask for, whether counts are
+        proportional to light, the channel to keep, frames thrown away before each that counts, and whether the exposure
+        cannot be set (then `exposures_s` has one entry, which says what it is).
     """
 
     kind: Literal["sim", "opencv", "none"]
@@ -103,8 +106,12 @@ class CameraConfig:
     offset_dn: float
     device: int | str
     backend: str
-    pixel_format: str
-    discard: int
+    fourcc: str | None
+    gain: float | None
+    linear: bool
+    channel: int | None
+    stale_frames: int | None
+    fixed: bool
 
 
 @dataclass(frozen=True)
@@ -302,14 +309,20 @@ def _camera(table: Table, sim: SimConfig | None) -> CameraConfig:
         read_noise_e=table.number("read_noise_e", lower=0.0, upper=1e5, unit="e"),
         offset_dn=table.number("offset_dn", 0.0, lower=0.0, upper=2.0**bit_depth - 1, unit="DN"),
         device=device,
-        backend=table.text("backend", "auto"),
-        pixel_format=table.text("pixel_format", ""),
-        discard=table.integer("discard", 4, lower=0, upper=100, unit="frames"),
+        backend=table.text("backend", choices=BACKENDS) if kind == "opencv" else table.text("backend", ""),
+        fourcc=table.text("fourcc") if "fourcc" in table else None,
+        gain=table.number("gain", lower=0.0) if "gain" in table else None,
+        linear=table.flag("linear", kind == "sim"),
+        channel=table.integer("channel", lower=0, upper=3) if "channel" in table else None,
+        stale_frames=table.integer("stale_frames", lower=0, upper=100, unit="frames") if "stale_frames" in table else None,
+        fixed=table.flag("fixed", False),
     )
     table.finish()
     exposures = config.exposures_s
     if any(b <= a for a, b in itertools.pairwise(exposures)):
         table.report("exposures_s", f"is {list(exposures)}; write each exposure once, the shortest first")
+    if config.fixed and len(exposures) != 1:
+        table.report("exposures_s", f"has {len(exposures)} entries; a camera whose exposure is fixed has one")
     x0, y0, w, h = roi
     if w < 1 or h < 1 or x0 + w > width or y0 + h > height:
         table.report("roi", f"= {list(roi)} (x0, y0, width, height) must lie within the image of {width} x {height} pixels")

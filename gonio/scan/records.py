@@ -76,6 +76,8 @@ class BlockRecord:
         Joint angles [rad]; empty for a dark block.
     time_s : float
         Middle of the block [s].
+    times_s : tuple of float
+        Middle of each repeat [s].
     session : int
     exposures_s : tuple of float
         Exposures asked for [s].
@@ -97,6 +99,7 @@ class BlockRecord:
     lamp_on: bool
     flags: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
+    times_s: tuple[float, ...] = ()
     wall_time: str = ""
 
 
@@ -119,7 +122,7 @@ def from_json(kind: type[T], text: str) -> T:
         names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if not isinstance(values, dict) or not set(values) <= names:
             raise ValueError("wrong fields")
-        for name in ("flags", "exposures_s"):
+        for name in ("flags", "exposures_s", "times_s"):
             if name in values:
                 values[name] = tuple(values[name])
         if "health" in values:
