@@ -206,12 +206,14 @@ def _climb(problem: Problem, u: Array, iterations: int = 60) -> Mode | None:
 
 
 def _first_scale(problem: Problem, u: Array) -> Array:
-    """Square root of a covariance from the least-squares Jacobian; noise parameters get 0.3."""
+    """Square root of a covariance from the least-squares Jacobian; noise parameters get 0.3 of their size."""
     d, h = len(u), 1e-4
     r = _residuals(problem, np.vstack((u + h * np.eye(d), u - h * np.eye(d))))
     jacobian = (r[:d] - r[d:]).T / (2 * h)
     normal = jacobian.T @ jacobian
-    normal += np.diag([10.0 if name.startswith("noise.") else 1e-2 for name in problem.space.names])
+    noise = np.array([name.startswith("noise.") for name in problem.space.names])
+    normal[noise] = normal[:, noise] = 0.0
+    normal += np.diag(np.where(noise, 10.0 / np.maximum(np.abs(u), 1e-6) ** 2, 1e-2))
     w, q = np.linalg.eigh(normal)
     return _bounded(q / np.sqrt(np.maximum(w, 1e-12)))
 

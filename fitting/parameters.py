@@ -4,8 +4,10 @@ A parameter of the model, a shared error and a noise term are treated alike. A b
 
 .. math:: u = \operatorname{logit}\frac{g(x)-g(a)}{g(b)-g(a)}, \qquad g(x) = x \text{ or } \ln x,
 
-the logarithm where the prior is one of a scale; an unbounded one as ``u = (x - mean) / sd`` of its normal prior. The
-density of u holds the Jacobian dx/du, so the posterior of x does not depend on the choice.
+the logarithm where the prior is one of a scale; an unbounded one as ``u = (x - mean) / sd`` of its normal prior. A
+half-normal one, as of a noise that enters squared, is folded: ``x = a + sd |u|``, so a noise of about zero is the middle of
+a hill and not the end of a long tail. The density of u holds the Jacobian dx/du, so the posterior of x does not depend on
+the choice.
 
 This module knows names, ranges and priors, but no data.
 """
@@ -26,7 +28,7 @@ from gonio.brdf import Model, term_names
 from gonio.errors import ParameterError
 
 Array = NDArray[np.float64]
-_AFFINE, _LOGIT, _LOGIT_OF_LN = 0, 1, 2
+_AFFINE, _LOGIT, _LOGIT_OF_LN, _FOLDED = range(4)
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,12 @@ def declare(models: Sequence[Model]) -> list[Declared]:
     return declared
 
 
+def _form(q: Prior) -> int:
+    if q.kind == "half_normal":
+        return _FOLDED
+    return _AFFINE if not q.bounded else _LOGIT_OF_LN if q.logarithmic else _LOGIT
+
+
 def _forward(u, form, lower, upper, code, a, b, x, log_prior):  # type: ignore[no-untyped-def]
     """x and the log density of u, Jacobian included; u (w, d) -> x (w, d), log_prior (w,)."""
     for w in range(u.shape[0]):
@@ -72,6 +80,11 @@ def _forward(u, form, lower, upper, code, a, b, x, log_prior):  # type: ignore[n
             if form[i] == _AFFINE:
                 value = a[i] + b[i] * u[w, i]
                 log_x = 0.0
+            elif form[i] == _FOLDED:
+                value = lower[i] + b[i] * abs(u[w, i])
+                log_x = 0.0
+                if value > upper[i]:
+                    total = -math.inf
             else:
                 # sigma(u) and ln(sigma (1 - sigma)) without overflow
                 e = math.exp(-abs(u[w, i]))
@@ -170,8 +183,7 @@ class Space:
         self.units = {p.name: p.unit for _, p in kept}
         self.columns = np.array([i for i, _ in kept], dtype=np.int64)
         self.template = np.array([self.fixed.get(p.name, math.nan) for p in self.declared])
-        forms = [_AFFINE if not q.bounded else _LOGIT_OF_LN if q.logarithmic else _LOGIT for q in self.priors]
-        self._form = np.array(forms, dtype=np.int64)
+        self._form = np.array([_form(q) for q in self.priors], dtype=np.int64)
         self._code = np.array([q.code for q in self.priors], dtype=np.int64)
         self._lower, self._upper, self._a, self._b = (
             np.array([getattr(q, key) for q in self.priors], dtype=float) for key in ("lower", "upper", "a", "b")
@@ -205,6 +217,9 @@ class Space:
         for i, q in enumerate(self.priors):
             if self._form[i] == _AFFINE:
                 u[:, i] = (x[:, i] - q.a) / q.b
+                continue
+            if self._form[i] == _FOLDED:
+                u[:, i] = (x[:, i] - q.lower) / q.b
                 continue
             if self._form[i] == _LOGIT:
                 s = (x[:, i] - q.lower) / (q.upper - q.lower)

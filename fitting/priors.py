@@ -69,7 +69,7 @@ class Prior:
     @property
     def logarithmic(self) -> bool:
         """The natural coordinate of the parameter is its logarithm."""
-        return self.lower > 0 and self.kind in ("log_uniform", "log_normal", "half_normal")
+        return self.kind in ("log_uniform", "log_normal")
 
     def log_density(self, x: Array) -> Array:
         """Logarithm of the density, up to a constant; -inf outside the range.

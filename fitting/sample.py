@@ -108,6 +108,7 @@ def run(
     modes: Sequence[Mode],
     *,
     seed: int,
+    quantities: Callable[[Array], Array] | None = None,
     rule: Rule | None = None,
     progress: Progress | None = None,
 ) -> Chains:
@@ -121,6 +122,8 @@ def run(
         Walkers start at each in proportion to its mass, spread by 0.5 to 1 times its Laplace covariance.
     seed : int
         Draws are a function of the seed.
+    quantities : callable, optional
+        (w, d) -> (w, d): the values on which convergence is judged; default u itself.
     rule : Rule, optional
     progress : callable, optional
         ``progress(done, total)`` with steps of all ensembles; the total is an estimate that may change.
@@ -155,8 +158,9 @@ def run(
                     progress(steps * rule.ensembles + e * (target - steps) + b - steps, total * rule.ensembles)
         steps = target
         chain = np.stack([s.get_chain() for s in samplers])  # (ensemble, step, walker, d)
-        tau, burn_in = _settle(chain, rule)
-        kept = chain[:, burn_in:]
+        judged = chain if quantities is None else quantities(chain.reshape(-1, d)).reshape(chain.shape)
+        tau, burn_in = _settle(judged, rule)
+        kept = judged[:, burn_in:]
         rhat = split_rhat(kept[:, :: max(1, int(tau.max() / 2))].reshape(rule.ensembles, -1, d))
         long_enough = kept.shape[1] > rule.taus * float(tau.max())
         longest = float(tau.max())
@@ -170,7 +174,7 @@ def run(
     if progress is not None:
         progress(steps * rule.ensembles, steps * rule.ensembles)
     return Chains(
-        u=kept,
+        u=chain[:, burn_in:],
         log_probability=np.stack([s.get_log_prob() for s in samplers])[:, burn_in:],
         tau=tau,
         rhat=rhat,

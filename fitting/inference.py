@@ -1,0 +1,192 @@
+r"""One fit from samples to posterior.
+
+The steps: declare the parameters, find the modes, judge chi^2, sample, and put everything a reader needs to judge the
+result beside the draws. Nothing is read, written or printed here.
+
+If the model misses the data by more than their stated uncertainty (chi^2/N above 1.5, or 4 standard deviations for few
+samples), intervals from that uncertainty alone are far too narrow and around a biased value. Then a relative discrepancy
+of the model, ``noise.discrepancy``, is inferred as well, unless the caller forbids it, and the diagnostics say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fitting import optimum, sample
+from fitting.diagnostics import advice, contraction, misfit_limit
+from fitting.likelihood import Problem
+from gonio import brdf
+from gonio.posterior import Posterior
+from gonio.samples import BRDFSamples
+
+Array = NDArray[np.float64]
+MAX_SAMPLES = 5000
+
+
+def fit(
+    samples: BRDFSamples,
+    model: str = "lambertian+ggx",
+    *,
+    free: Iterable[str] = (),
+    fix: Mapping[str, float] | None = None,
+    priors: Mapping[str, Sequence[object]] | None = None,
+    seed: int = 0,
+    max_steps: int | None = None,
+    progress: sample.Progress | None = None,
+    shared: bool = True,
+    discrepancy: bool | None = None,
+    max_samples: int | None = MAX_SAMPLES,
+    rule: sample.Rule | None = None,
+) -> Posterior:
+    """Posterior of a BRDF model given samples.
+
+    Parameters
+    ----------
+    samples : BRDFSamples
+    model : str
+        Models joined by ``+``.
+    free : iterable of str
+        Parameters to free that the model holds by default, such as ``"ggx.k_s"``.
+    fix : mapping of str to float
+        Parameters to hold, with their values.
+    priors : mapping of str to tuple
+        Instead of the default priors; see `fitting.priors`.
+    seed : int
+        The same samples, options and seed give the same draws, byte by byte.
+    max_steps : int, optional
+        Longest chain per ensemble; default that of `rule`.
+    progress : callable, optional
+        ``progress(done, total)``; the total is an estimate.
+    shared : bool
+        Infer the shared errors of the samples; False takes them as exactly 0, and the intervals are too narrow.
+    discrepancy : bool, optional
+        Infer a relative discrepancy of the model. Default: only if chi^2/N demands it.
+    max_samples : int, optional
+        More samples than this are cut to a random choice, and the diagnostics say so. None: all.
+    rule : fitting.sample.Rule, optional
+        How much to sample.
+
+    Returns
+    -------
+    Posterior
+        ``diagnostics["converged"]`` says whether the chains can be trusted, ``diagnostics["advice"]`` what to do.
+        `draws` are thinned to about two per autocorrelation time of a walker.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown or a value outside its range.
+    DatasetError
+        If there is nothing to fit.
+    ConvergenceError
+        If no parameters give the samples a finite probability.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> theta_i = np.linspace(0.1, 1.2, 40)
+    >>> white = BRDFSamples.plain(theta_i, 0.0, 0.3, 1.0, np.full(40, 0.5 / np.pi), np.full(40, 0.003))
+    >>> paper = fit(white, "lambertian", seed=1).summary()["lambertian.albedo"]
+    >>> abs(paper["mean"] - 0.5) < paper["sd"] and abs(paper["sd"] / (0.003 * np.pi / np.sqrt(40)) - 1) < 0.05
+    True
+    """
+    rule = rule or sample.Rule()
+    if max_steps is not None:
+        rule = sample.Rule(**(rule.__dict__ | {"max_steps": max_steps}))
+    models = brdf.parse(model)
+    first, second = (int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2))
+    given = len(samples)
+    if max_samples is not None and given > max_samples:
+        chosen = np.sort(np.random.default_rng(first).choice(given, max_samples, replace=False))
+        samples = samples.select(chosen)
+    options: dict[str, Any] = {"free": tuple(free), "fix": dict(fix or {}), "priors": dict(priors or {}), "shared": shared}
+    problem = Problem(samples, models, discrepancy=bool(discrepancy), **options)
+    modes = optimum.find(problem, np.random.default_rng(first))
+    stated = chi2_per_n = _chi2_per_n(problem, modes[0].u)
+    unknown = np.isnan(samples.u_f_r)
+    inflate = discrepancy is None and chi2_per_n > misfit_limit(len(samples)) and not unknown.all()
+    if inflate and "noise.discrepancy" not in options["fix"]:
+        problem = Problem(samples, models, discrepancy=True, **options)
+        modes = optimum.find(problem, np.random.default_rng(first))
+        chi2_per_n = _chi2_per_n(problem, modes[0].u)
+    chains = sample.run(
+        problem.log_probability,
+        modes,
+        seed=second,
+        quantities=lambda u: problem.space.natural(u)[0],
+        rule=rule,
+        progress=progress,
+    )
+    thin = max(1, int(chains.tau.max() / 2)) if chains.converged else 1 + chains.u.shape[1] // 200
+    u = chains.u[:, ::thin]
+    x = problem.space.natural(u.reshape(-1, len(problem.space)))[0]
+    draws = x.reshape(u.shape[0], -1, len(problem.space))
+    log_probability = chains.log_probability[:, ::thin].reshape(u.shape[0], -1)
+    names = problem.space.names
+    contractions = _contractions(problem, x)
+    inferred = "noise.discrepancy" in names
+    noise = "inferred" if unknown.all() else "mixed" if unknown.any() else "stated"
+    said = advice(
+        chi2_per_n=stated,
+        n_samples=len(samples),
+        n_parameters=len(names),
+        contractions={name: contractions[name] for name in problem.model_names},
+        noise=noise,
+        discrepancy=inferred,
+        acceptance=chains.acceptance,
+    )
+    if given > len(samples):
+        said.append(f"a random {len(samples)} of {given} samples were used; raise max_samples to use more")
+    if not chains.converged:
+        said.insert(0, chains.status)
+    best = problem.space.natural(modes[0].u[None])[0][0]
+    kept = chains.u.shape[0] * chains.u.shape[1] * chains.u.shape[2]
+    diagnostics = {
+        "converged": chains.converged,
+        "status": chains.status,
+        "advice": said,
+        "tau": dict(zip(names, map(float, chains.tau), strict=True)),
+        "ess": {name: kept / float(tau) for name, tau in zip(names, chains.tau, strict=True)},
+        "rhat": dict(zip(names, map(float, chains.rhat), strict=True)),
+        "acceptance": chains.acceptance,
+        "chi2_per_n": stated,
+        "chi2_per_n_with_discrepancy": chi2_per_n if inferred else None,
+        "n_samples": len(samples),
+        "n_samples_given": given,
+        "n_parameters": len(names),
+        "noise": noise,
+        "discrepancy": inferred,
+        "contraction": contractions,
+        "optimum": dict(zip(names, map(float, best), strict=True)),
+        "modes": len(modes),
+        "units": dict(problem.space.units),
+        "priors": {
+            name: {"kind": q.kind, "a": q.a, "b": q.b, "lower": q.lower, "upper": q.upper}
+            for name, q in zip(names, problem.space.priors, strict=True)
+        },
+        "ensembles": rule.ensembles,
+        "walkers": chains.u.shape[2],
+        "steps": chains.steps,
+        "burn_in": chains.burn_in,
+        "thin": thin,
+        "seed": seed,
+    }
+    return Posterior(model, names, draws, log_probability, dict(problem.space.fixed), diagnostics)
+
+
+def _chi2_per_n(problem: Problem, u: Array) -> float:
+    """chi^2 / N at a point, with the variances as they are there."""
+    _, chi2 = problem.log_likelihood(problem.space.natural(u[None])[0])
+    return float(chi2[0]) / len(problem.samples)
+
+
+def _contractions(problem: Problem, x: Array) -> dict[str, float]:
+    out = {}
+    for i, (name, q) in enumerate(zip(problem.space.names, problem.space.priors, strict=True)):
+        value = np.log(x[:, i]) if q.logarithmic else x[:, i]
+        out[name] = contraction(q.sd(), float(np.std(value)))
+    return out
