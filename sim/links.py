@@ -98,6 +98,7 @@ class Pump:
                 link.on_due()
             if link.closed:
                 self._forget(link)
+                link.close()
 
     def run(self, stop: Callable[[], bool], poll_s: float = 0.05) -> None:
         """Step until `stop` says so."""
@@ -126,12 +127,13 @@ class _StreamLink:
         self._clock = clock
         self._queue: deque[tuple[float, bytes]] = deque()
         self._unsent = b""
+        self._retry = 0.0  # when to try again what the receiver did not take
         self._heard = 0.0
         self.closed = False
 
     def due(self) -> float | None:
         if self._unsent:
-            return time.monotonic() + 0.001
+            return self._retry
         return self._queue[0][0] if self._queue else None
 
     def on_due(self) -> None:
@@ -154,6 +156,7 @@ class _StreamLink:
         if self._unsent:
             with suppress(BlockingIOError):
                 self._unsent = self._unsent[self._write(self._unsent) :]
+            self._retry = time.monotonic() + 0.001
 
     def _write(self, data: bytes) -> int:
         raise NotImplementedError
@@ -258,14 +261,14 @@ class _Connection(_StreamLink):
         if data:
             self._receive(data)
         else:
-            self.close()
+            self.closed = True  # the pump closes it: until then no new client can get the same descriptor
         return ()
 
     def _write(self, data: bytes) -> int:
         try:
             return self._socket.send(data)
         except (BrokenPipeError, ConnectionResetError):
-            self.close()
+            self.closed = True
             return len(data)
 
     def close(self) -> None:
@@ -314,7 +317,7 @@ class TcpLink:
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if self._client is not None:
-            self._client.close()
+            self._client.closed = True
         self._device.idle()
         self._client = _Connection(self._device, self._clock, client)
         return (self._client,)
