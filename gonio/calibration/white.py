@@ -140,4 +140,4 @@ class Reference:
     def drift(self) -> float:
         """Largest relative change between neighbouring blocks, signed; 0 if there is one block only."""
         pairs = zip(self.blocks, self.blocks[1:], strict=False)
-        return max(((b.value - a.value) / (0.5 * (a.value + b.value)) for a, b in pairs), key=abs, default=0.0)
+        return max((2.0 * (b.value - a.value) / (a.value + b.value) for a, b in pairs), key=abs, default=0.0)

@@ -25,6 +25,7 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -53,7 +54,7 @@ from gonio.samples import BRDFSamples, SharedError
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
-ENCODER_STEP = 2.0 * np.pi / COUNTS_PER_TURN
+ENCODER_STEP = 2.0 * math.pi / COUNTS_PER_TURN
 """One count of the servos' position [rad]."""
 MIN_COSINE = 1e-3
 """Lamp or camera closer to the horizon of the specimen than this cosine: no sample."""
@@ -107,7 +108,7 @@ class Setup:
     beta: float
     u_beta: float
     u_zero: tuple[float, float, float]
-    u_encoder: float = ENCODER_STEP / np.sqrt(12.0)
+    u_encoder: float = ENCODER_STEP / math.sqrt(12.0)
     max_nonlinearity: float = 0.01
     attributes: Mapping[str, str] = field(default_factory=dict)
 
@@ -229,8 +230,8 @@ def _samples(
     columns = [np.ones(len(kept))]
     columns += [slope_i[:, 2, k] / cos_i - white_slope[k] for k in range(3)]
     if np.any(bow):
-        largest = abs(reference.drift)
-        shared.append(SharedError("drift", largest / np.sqrt(12.0)))
+        largest = float(abs(reference.drift))
+        shared.append(SharedError("drift", largest / math.sqrt(12.0)))
         columns.append(bow / largest)
     none = np.zeros((len(kept), 3, 1))
     after = np.zeros((len(kept), 3, len(shared) - 4))
