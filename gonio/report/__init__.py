@@ -172,13 +172,15 @@ def _figures(
             lambda: brdf_slices(measured, fit, band=band, truth=known, table=table),
         ))  # fmt: skip
         if posterior is not None and fit is not None:
+            # without the discrepancy of the model: the picture is to show where the model fails
             centre = dict(posterior.fixed) | {name: row["median"] for name, row in posterior.summary().items()}
+            centre["noise.discrepancy"] = 0.0
             left = residuals(measured, fit, centre)
             jobs.append((
                 "residuals",
-                "Residuals of the fit, shared errors at their fitted values, in units of the uncertainty of one sample (in "
-                "% of the model where that is unknown): against the half angle, in the order of the samples, and as a "
-                "histogram beside a unit normal. Between -2 and 2 is grey.",
+                "Residuals of the fit, shared errors at their fitted values, in units of the stated uncertainty of one "
+                "sample, or of the inferred one (in % of the model where there is neither): against the half angle, in the "
+                "order of the samples, and as a histogram beside a unit normal. Between -2 and 2 is grey.",
                 lambda: residual_plot(measured, left),
             ))  # fmt: skip
         jobs.append((

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 import gonio
 from gonio import brdf as brdf_models
 from gonio.brdf.base import BRDF
+from gonio.report.chains import NUISANCE
 from gonio.report.html import Cell, Table
-from gonio.report.residuals import expected_reading, verdict
+from gonio.report.residuals import expected_reading, is_sound, verdict
 from gonio.samples import BRDFSamples
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from gonio.maps import ReflectanceMap
     from gonio.posterior import Posterior
 
+_SAMPLER = ("ensembles", "walkers", "steps", "burn_in", "thin", "seed")
 Array = NDArray[np.float64]
 Rows = list[tuple[str, Cell]]
 
@@ -91,7 +93,10 @@ def of_fit(posterior: Posterior) -> Rows:
     held = {n: v for n, v in posterior.fixed.items() if not (n.startswith(("shared.", "noise.")) and v == 0.0)}
     if held:
         rows.append(("held fixed", ", ".join(f"{name} = {value:g}" for name, value in held.items())))
-    rows.append(("draws", f"{n_chain} chains of {n_draw}, burn-in removed"))
+    rows.append(("draws", f"{n_chain} independent chains of {n_draw}, burn-in removed"))
+    sampler = [f"{key.replace('_', '-')} {d[key]}" for key in _SAMPLER if isinstance(d.get(key), int)]
+    if sampler:
+        rows.append(("sampler", ", ".join(sampler)))
     converged = d.get("converged")
     state = "not known" if converged is None else "converged" if converged else "NOT CONVERGED"
     numbers = []
@@ -102,12 +107,9 @@ def of_fit(posterior: Posterior) -> Rows:
             numbers.append(f"{sense} {label} {float(worst(values)):.4g}")
     acceptance = d.get("acceptance")
     if acceptance is not None:
-        numbers.append(f"acceptance {float(np.mean(acceptance)):.2f}")
+        numbers.append(f"acceptance {float(np.mean(np.asarray(acceptance, dtype=float))):.2f}")
     rows.append(("convergence", state + (f" ({', '.join(numbers)})" if numbers else "")))
-    advice = d.get("advice")
-    if advice:
-        rows.append(("advice", advice if isinstance(advice, str) else " ".join(map(str, advice))))
-    rows.append(("fit quality", verdict(_number(d.get("chi2_per_n")), int(d.get("n_samples") or 0))))
+    rows.append(("fit quality", _verdict(d)))
     return rows
 
 
@@ -137,7 +139,7 @@ def parameters(posterior: Posterior, truth: Mapping[str, float] | None = None, s
         rows.append(row)
     note = "68 %: from the 16 % to the 84 % quantile of the draws; 95 %: from 2.5 % to 97.5 %."
     if contraction:
-        note += " Contraction: 1 - sd/sd of the prior; near 0 the data say nothing about the parameter."
+        note += " Contraction: 1 - variance/variance of the prior; near 0 the data say nothing about the parameter."
     return Table("Parameters of the fit", header, rows, note)
 
 
@@ -152,13 +154,14 @@ def budget(samples: BRDFSamples, brdf: BRDF | None, posterior: Posterior | None 
     for k, error in enumerate(samples.shared):
         name = f"shared.{error.name}"
         unit, scale = _unit(name, samples)
+        shown = "" if unit == "1" else f" {unit}"
         effect = np.abs(samples.d_ln_f[:, k]) if brdf is None else _sensitivity(samples, brdf, k)
         effect = effect[np.isfinite(effect)] * error.u * 100.0
         middle, high = np.quantile(effect, [0.5, 0.95]) if effect.size else (np.nan, np.nan)
         fitted = ""
         if name in summary:
-            fitted = f"{scale * summary[name]['mean']:.3g} ± {scale * summary[name]['sd']:.2g} {unit}"
-        before, middle = f"{scale * error.u:.3g} {unit}", float(middle)
+            fitted = f"{scale * summary[name]['mean']:.3g} ± {scale * summary[name]['sd']:.2g}{shown}"
+        before, middle = f"{scale * error.u:.3g}{shown}", float(middle)
         rows.append([f"{error.name}, shared", before, fitted, middle, float(high), 2.0 * middle])
     if not rows:
         return None
@@ -208,26 +211,26 @@ def of_table(table: TabulatedBRDF) -> Table:
 
 
 def warnings_of(samples: BRDFSamples | None, posterior: Posterior | None) -> list[str]:
-    """What a reader must know before believing a number."""
-    found = []
-    if samples is not None and len(samples) and not np.any(np.isfinite(samples.u_f_r)):
-        found.append("The samples carry no uncertainty; the fit infers one, so chi2/N cannot test the model.")
-    if posterior is None:
-        return found
-    d = posterior.diagnostics
-    if d.get("converged") is False:
-        advice = d.get("advice")
-        text = advice if isinstance(advice, str) else " ".join(map(str, advice or ()))
-        found.append(f"The chains have not converged: intervals and bands are not to be trusted. {text}".strip())
-    chi2 = _number(d.get("chi2_per_n"))
-    if np.isfinite(chi2):
-        sentence = verdict(chi2, int(d.get("n_samples") or 0))
-        if "within their uncertainties." not in sentence or "does not" in sentence:
+    """What a reader must know before believing a number: the advice of the fit, and what it did not say."""
+    found: list[str] = []
+    if posterior is not None:
+        d = posterior.diagnostics
+        if d.get("converged") is False:
+            found.append("The chains have not converged: intervals and bands are not to be trusted.")
+        advice = d.get("advice") or []
+        found += [advice] if isinstance(advice, str) else [str(sentence) for sentence in advice]
+        known, sentence = " ".join(found), _verdict(d)
+        if np.isfinite(_number(d.get("chi2_per_n"))) and not is_sound(sentence) and "chi2/N" not in known:
             found.append(sentence)
-    flat = [name for name, value in per_parameter(d.get("contraction"), posterior.names).items()
-            if value < 0.3 and not name.startswith(("shared.", "noise."))]  # fmt: skip
-    if flat:
-        found.append(f"The data hardly constrain {', '.join(flat)}: the interval is mostly that of the prior.")
+        weak = [
+            name
+            for name, value in per_parameter(d.get("contraction"), posterior.names).items()
+            if value < 0.3 and not name.startswith(NUISANCE) and name not in known
+        ]
+        if weak:
+            found.append(f"The data hardly constrain {', '.join(weak)}: the interval is mostly that of the prior.")
+    if samples is not None and len(samples) and np.all(np.isnan(samples.u_f_r)) and "no uncertainty" not in " ".join(found):
+        found.append("The samples state no uncertainty: nothing here tests a model against the noise of the measurement.")
     return found
 
 
@@ -240,6 +243,11 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def _verdict(d: Mapping[str, Any]) -> str:
+    noise, discrepancy = str(d.get("noise", "stated")), bool(d.get("discrepancy"))
+    return verdict(_number(d.get("chi2_per_n")), int(d.get("n_samples") or 0), noise=noise, discrepancy=discrepancy)
 
 
 def per_parameter(value: Any, names: Sequence[str]) -> dict[str, float]:

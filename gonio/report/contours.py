@@ -75,12 +75,12 @@ def map_contours(
         if width is not None:
             middle = _number(float(np.nanmedian(width)))
             heading = f"68 % band of $R$: half-width [%], median {middle}"
-            _panel(panels[1], reflectance_map, width, heading, "YlOrBr", about=6, flat=0.05)
+            _panel(panels[1], reflectance_map, width, heading, "YlOrBr", about=6, flat=0.05, share=2e-3)
             panels[1].set_ylabel("")
     return figure
 
 
-def levels(value: Array, about: int = 10, flat: float = 1e-9) -> Array:
+def levels(value: Array, about: int = 10, flat: float = 1e-9, share: float = 1.2e-4) -> Array:
     """Round contour levels: linear steps, or 1-2-5 steps where the values span more than these would show.
 
     Parameters
@@ -91,6 +91,8 @@ def levels(value: Array, about: int = 10, flat: float = 1e-9) -> Array:
         How many levels to aim at.
     flat : float, optional
         A map whose values differ by less than this, relative to the largest, is constant.
+    share : float, optional
+        Least part of the map above the last line, below the first and between two: closer lines run into each other.
 
     Returns
     -------
@@ -104,9 +106,9 @@ def levels(value: Array, about: int = 10, flat: float = 1e-9) -> Array:
     if not high - low > flat * max(abs(low), abs(high)):
         return np.zeros(0)
     positive = finite[finite > 0.0]
-    least = 1.2e-4 * finite.size  # points between two lines; fewer, and the lines run into each other
+    least = share * finite.size
     if low >= 0.0 and high > 6.0 * float(np.median(positive)):
-        start = max(float(np.quantile(positive, 0.02)), 1e-4 * high)
+        start = max(float(np.quantile(positive, 0.08)), 1e-4 * high)
         decades = range(int(np.floor(np.log10(start))), int(np.ceil(np.log10(high))) + 1)
         steps = (1.0, 2.0, 5.0) if np.log10(high / start) > 1.5 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
         candidates = np.array([step * 10.0**decade for decade in decades for step in steps])
@@ -114,20 +116,29 @@ def levels(value: Array, about: int = 10, flat: float = 1e-9) -> Array:
         candidates = np.asarray(MaxNLocator(about, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
     kept: list[float] = []
     for level in candidates[(candidates > low) & (candidates < high)]:
-        if np.sum(finite > level) >= least and (not kept or np.sum((finite > kept[-1]) & (finite <= level)) >= least):
+        since = kept[-1] if kept else -np.inf
+        if np.sum(finite > level) >= least and np.sum((finite > since) & (finite <= level)) >= least:
             kept.append(float(level))
     return np.array(kept)
 
 
 def _panel(
-    axes: Axes, one: ReflectanceMap, value: Array, title: str, palette: str, about: int = 10, flat: float = 1e-9
+    axes: Axes,
+    one: ReflectanceMap,
+    value: Array,
+    title: str,
+    palette: str,
+    *,
+    about: int = 10,
+    flat: float = 1e-9,
+    share: float = 1.2e-4,
 ) -> None:
     import matplotlib
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
     p, q = one.p, one.q
     shown = np.ma.masked_invalid(value)
-    lines = levels(value, about, flat)
+    lines = levels(value, about, flat, share)
     dark = np.asarray((one.value <= 0.0) & np.isfinite(one.value))
     if lines.size:
         # tints light enough for black labels, one for each interval
@@ -138,8 +149,10 @@ def _panel(
         drawn = axes.contour(p, q, shown, levels=lines, colors=style.BLACK, linewidths=0.8)
         # a label needs room: a two-hundredth of the map above its line and below
         above = np.array([np.mean(value[np.isfinite(value)] > line) for line in lines])
-        axes.clabel(drawn, lines[(above > 0.005) & (above < 0.995)], fmt=_number, fontsize=7, inline_spacing=3)
-        _summit(axes, p, q, value, above[-1] < 0.005)
+        roomy = lines[(above > 0.005) & (above < 0.995)]
+        labels = axes.clabel(drawn, roomy, fmt=_number, fontsize=7, inline_spacing=3)
+        if _number(lines[-1]) not in [label.get_text() for label in labels]:
+            _summit(axes, p, q, value)
     else:
         low, high = float(np.nanmin(value)), float(np.nanmax(value))
         axes.set_facecolor(matplotlib.colormaps[palette](0.1, alpha=0.5))
@@ -178,10 +191,8 @@ def _terminator(axes: Axes, p: Array, q: Array, p_s: float, q_s: float) -> None:
     axes.plot(ends[:, 0], ends[:, 1], color=style.VERMILION, lw=1.1, ls=(0, (4, 2)), zorder=5)
 
 
-def _summit(axes: Axes, p: Array, q: Array, value: Array, narrow: bool) -> None:
-    """Largest value where a narrow peak leaves no room for the labels of its lines."""
-    if not narrow:
-        return
+def _summit(axes: Axes, p: Array, q: Array, value: Array) -> None:
+    """Say the largest value: for a peak so narrow that its lines leave no room for labels."""
     row, column = np.unravel_index(int(np.nanargmax(value)), value.shape)
     side = 1 if column < 0.6 * len(p) else -1
     axes.annotate(

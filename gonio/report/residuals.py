@@ -112,26 +112,49 @@ def residuals(samples: BRDFSamples, brdf: BRDF, values: Mapping[str, float] | No
     return Residuals(expected, u, pull, ratio)
 
 
-def verdict(chi2_per_n: float, n: int) -> str:
+def verdict(chi2_per_n: float, n: int, *, noise: str = "stated", discrepancy: bool = False) -> str:
     """What chi2/N means for the reader, in one sentence.
 
     A right model with right uncertainties gives chi2/N = 1 with a standard deviation of sqrt(2/N); within four of them,
     and between 0.7 and 1.5 in any case, nothing is said against it.
+
+    Parameters
+    ----------
+    chi2_per_n : float
+        With the uncertainties as stated, or as inferred where there are none.
+    n : int
+        Number of samples.
+    noise : str, optional
+        ``"inferred"`` if no sample states an uncertainty, so that chi2/N is near 1 whatever the model.
+    discrepancy : bool, optional
+        The fit has inferred a discrepancy of the model, which its intervals contain.
     """
     if not np.isfinite(chi2_per_n):
         return "chi2/N is not known, as the samples carry no uncertainty: the fit has not been tested against them."
+    if noise == "inferred":
+        return f"chi2/N = {chi2_per_n:.3g} by construction, as the noise was inferred: it does not test the model."
     margin = 4.0 * np.sqrt(2.0 / max(n, 1))
     if chi2_per_n > max(1.5, 1.0 + margin):
+        consequence = (
+            "The intervals and bands contain an inferred discrepancy of the model."
+            if discrepancy
+            else "The intervals and bands are those of a wrong model and too narrow: do not quote them."
+        )
         return (
-            f"chi2/N = {chi2_per_n:.2f}: the model does not describe the samples within their uncertainties. The intervals "
-            "and bands are those of a wrong model and too narrow; do not quote them. Try another model or a larger noise."
+            f"chi2/N = {chi2_per_n:.3g}, expected 1: the model does not describe the samples within their uncertainties. "
+            f"{consequence} Try another model, or look for a fault of the measurement."
         )
     if chi2_per_n < min(0.7, 1.0 - margin):
         return (
-            f"chi2/N = {chi2_per_n:.2f}: the samples scatter less than their uncertainties say. The intervals and bands are "
-            "wider than they need be; check the noise model."
+            f"chi2/N = {chi2_per_n:.3g}, expected 1: the samples scatter less than their uncertainties say. The intervals "
+            "and bands are wider than they need be; check the noise model."
         )
-    return f"chi2/N = {chi2_per_n:.2f}: the model describes the samples within their uncertainties."
+    return f"chi2/N = {chi2_per_n:.3g}: the model describes the samples within their uncertainties."
+
+
+def is_sound(sentence: str) -> bool:
+    """True of a `verdict` that has nothing against the fit."""
+    return "the model describes the samples" in sentence
 
 
 def _measured_unit(vector: Array) -> Array:

@@ -67,7 +67,7 @@ def brdf_slices(
         centres = np.radians([15.0, 45.0, 75.0][:count])
     with style.look():
         rows, columns = style.grid_shape(len(centres), 3)
-        figure = style.new_figure(170.0, 16.0 + 56.0 * rows)
+        figure = style.new_figure(170.0, 20.0 + 56.0 * rows)
         panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
         for axes, centre in zip(panels.flat, centres, strict=False):
             chosen = np.flatnonzero(near & (np.abs(samples.theta_i - centre) <= np.radians(1.5)))
@@ -83,7 +83,9 @@ def brdf_slices(
             panels[bottom, column].tick_params(labelbottom=True)
         named = {text: line for axes in panels.flat for line, text in zip(*axes.get_legend_handles_labels(), strict=True)}
         if named:
-            figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), 6))
+            figure.legend(
+                named.values(), named.keys(), loc="outside lower center", ncols=len(named) if len(named) < 6 else 3
+            )
         if nothing_near:
             panels[0, 0].text(
                 0.5, 0.95, "no samples near\nthe plane of incidence", transform=panels[0, 0].transAxes,

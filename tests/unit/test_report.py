@@ -271,6 +271,8 @@ def test_residual_uncertainty_has_the_slope_and_the_inferred_noise() -> None:
 
 def test_verdict_names_the_consequence() -> None:
     assert "does not describe" in verdict(2.0, 300) and "do not quote" in verdict(2.0, 300)
+    assert "inferred discrepancy" in verdict(2.0, 300, discrepancy=True)
+    assert "does not test" in verdict(1.0, 300, noise="inferred")
     assert "scatter less" in verdict(0.3, 300)
     assert verdict(1.1, 300).endswith("within their uncertainties.")
     assert "not known" in verdict(math.nan, 300)
@@ -278,10 +280,13 @@ def test_verdict_names_the_consequence() -> None:
 
 
 def test_bad_fits_are_warned_about(samples: BRDFSamples, posterior: Posterior) -> None:
-    worse = dict(posterior.diagnostics) | {"converged": False, "chi2_per_n": 3.0, "advice": "run 5000 more steps"}
+    worse = dict(posterior.diagnostics) | {
+        "converged": False, "chi2_per_n": 3.0, "advice": ["run 5000 more steps"], "contraction": {"ggx.f_0": 0.1},
+    }  # fmt: skip
     poor = Posterior(posterior.model, posterior.names, posterior.draws, posterior.log_probability, posterior.fixed, worse)
     found = " ".join(content.warnings_of(samples, poor))
-    assert "not converged" in found and "5000" in found and "chi2/N = 3.00" in found
+    for said in ("not converged", "5000 more steps", "chi2/N = 3, expected 1", "hardly constrain ggx.f_0"):
+        assert said in found
     assert content.warnings_of(samples, posterior) == []
 
 
