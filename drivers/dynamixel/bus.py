@@ -1,12 +1,9 @@
-"""One Dynamixel line (Protocol 2.0) through the vendor's SDK, so that no answer is taken for another's.
+"""Several servos on one line: registers, states, and stopping them all.
 
-Status packets carry neither an address nor a sequence number. After a timeout the late answer may therefore arrive as
-the answer to the next question. So: every answer is checked for sender and exact length; after any timeout the line is
-drained until it is idle and then fenced by a read whose *length* changes each time; and the state of a servo is one
-block read of a length that nothing else has, believed only when two in a row agree.
-
-It refuses Protocol 1.0 (its checksum accepts 1.3 % of two-bit errors), never uses the calendar clock, and never sends
-from a signal handler: one lock, one transaction at a time. It knows counts, not angles.
+The state of a servo is one block read of a length that nothing else has, believed only when two in a row agree. Framing
+and CRC are the vendor's (`drivers.dynamixel.sdk`), timeouts and late answers are dealt with in `drivers.dynamixel.line`.
+It refuses Protocol 1.0, whose checksum accepts 1 % of two-bit errors, and never sends from a signal handler. It knows
+counts, not angles.
 
 References: ROBOTIS e-manual, DYNAMIXEL Protocol 2.0 (emanual.robotis.com/docs/en/dxl/protocol2).
 """
@@ -14,30 +11,18 @@ References: ROBOTIS e-manual, DYNAMIXEL Protocol 2.0 (emanual.robotis.com/docs/e
 from __future__ import annotations
 
 import logging
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from dynamixel_sdk.robotis_def import (
-    BROADCAST_ID,
-    COMM_RX_CORRUPT,
-    COMM_RX_TIMEOUT,
-    COMM_SUCCESS,
-    INST_PING,
-    INST_READ,
-    INST_REBOOT,
-    INST_SYNC_WRITE,
-    INST_WRITE,
-)
+from dynamixel_sdk.robotis_def import INST_PING, INST_READ, INST_REBOOT, INST_SYNC_WRITE, INST_WRITE
 
+from drivers.dynamixel.line import Line
 from drivers.dynamixel.registers import (
     BLOCK_ADDRESS,
     BLOCK_SIZE,
     GOAL_POSITION,
     HARDWARE_ERROR_STATUS,
-    SERVO_ID,
     STATUS_ERRORS,
     TORQUE_ENABLE,
     Block,
@@ -45,17 +30,11 @@ from drivers.dynamixel.registers import (
     decode_block,
     hardware_errors,
 )
-from drivers.dynamixel.sdk import ERROR_AT, ID_AT, LENGTH_AT, PARAMETERS_AT, Packets, Port
-from drivers.serial_port import port_errors
 from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError, HardwareStatusError, ProtocolError
 from gonio.interfaces import Clock
 
 logger = logging.getLogger(__name__)
 
-_FENCE_LENGTHS = (8, 9, 10, 11, 12)  # from address 0; all hold the id, none is the length of another answer
-_DRAIN_LIMIT_S = 5.0
-_HASTY_TIMEOUT_S = 0.05  # above the latency of a USB adapter, there and back
-_STATUS_CRC = 3
 _MOTION_SLACK_COUNTS = 4.0
 _TOP_SPEED_COUNTS_S = 8000.0  # 117 rev/min, beyond every X-series servo
 
@@ -123,39 +102,27 @@ class Bus:
             )
         self.port_name = port
         self.clock = clock
-        self.baud = baud
-        self.timeout_s = timeout_s
-        self.drain_s = drain_s
-        self.attempts = attempts
-        self.timeouts = 0
-        """Transactions that got no valid answer since the bus was opened."""
-        self._now = now
-        self._port = Port(port, timeout_s=timeout_s, now=now)
-        self._packets = Packets()
-        self._lock = threading.RLock()
+        self._line = Line(
+            port, baud=baud, timeout_s=timeout_s, drain_s=drain_s, now=now, attempts=attempts, label=self.label
+        )
         self._members: dict[int, Member] = {}
         self._last: dict[int, int] = {}  # last position seen [counts]
-        self._failing: set[int] = set()  # did not answer the last time
-        self._fences = 0
+
+    @property
+    def timeouts(self) -> int:
+        """Tries that got no valid answer since the bus was made."""
+        return self._line.timeouts
 
     # -- life
 
     def open(self) -> Bus:
         """Open the port."""
-        with self._lock:
-            self._port.baudrate = self.baud
-            if not self._port.setBaudRate(self.baud):
-                raise DeviceError(
-                    f"Port {self.port_name}: the Dynamixel SDK does not offer {self.baud} baud; "
-                    "use 57600, 115200, 1000000, 2000000, 3000000 or 4000000."
-                )
+        self._line.open()
         return self
 
     def close(self) -> None:
         """Close the port. Servos keep their torque and hold."""
-        with self._lock:
-            if self._port.is_open:
-                self._port.closePort()
+        self._line.close()
 
     def __enter__(self) -> Bus:
         return self.open()
@@ -182,30 +149,24 @@ class Bus:
 
     def ping(self, servo_id: int) -> tuple[int, int]:
         """Model number and firmware version."""
-        data, _ = self._ask(servo_id, INST_PING, b"", 3)
+        data, _ = self._line.ask(servo_id, INST_PING, b"", 3)
         return data[0] | data[1] << 8, data[2]
 
     def scan(self) -> dict[int, tuple[int, int]]:
         """All servos on the line, id -> (model number, firmware); takes about a second."""
-        with self._lock, self._transaction():
-            found, result = self._packets.broadcastPing(self._port)
-        if result not in (COMM_SUCCESS, COMM_RX_TIMEOUT) and not found:
-            raise ProtocolError(
-                f"Port {self.port_name}: answers to a broadcast ping collide; check that no two servos share an id."
-            )
-        return {int(servo_id): (int(model), int(firmware)) for servo_id, (model, firmware) in sorted(found.items())}
+        return self._line.scan()
 
     def read(self, servo_id: int, register: Register) -> int:
         """Value of a register."""
         parameters = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
-        data, error = self._ask(servo_id, INST_READ, parameters, register.size)
+        data, error = self._line.ask(servo_id, INST_READ, parameters, register.size)
         self._refuse(servo_id, f"reading {register.name}", error)
         return register.decode(data)
 
     def write(self, servo_id: int, register: Register, value: int, *, hasty: bool = False) -> bool:
         """Write a register and wait for the acknowledgement; True if the servo raises its alert bit."""
         parameters = register.address.to_bytes(2, "little") + register.encode(value)
-        _, error = self._ask(servo_id, INST_WRITE, parameters, 0, hasty=hasty)
+        _, error = self._line.ask(servo_id, INST_WRITE, parameters, 0, hasty=hasty)
         self._refuse(servo_id, f"{register.name} = {value}", error)
         return bool(error & 0x80)
 
@@ -214,12 +175,11 @@ class Bus:
         parameters = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
         for servo_id, value in values.items():
             parameters += bytes([servo_id]) + register.encode(value)
-        with self._lock, self._transaction():
-            self._sent(self._packets.transmit(self._port, BROADCAST_ID, INST_SYNC_WRITE, parameters))
+        self._line.tell(INST_SYNC_WRITE, parameters)
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque goes off, RAM registers fall back to their defaults."""
-        self._ask(servo_id, INST_REBOOT, b"", 0)
+        self._line.ask(servo_id, INST_REBOOT, b"", 0)
 
     # -- state
 
@@ -232,7 +192,7 @@ class Bus:
             nonlocal sent_s
             sent_s = self.clock.now()
 
-        data, error = self._ask(servo_id, INST_READ, parameters, BLOCK_SIZE, hasty=hasty, started=started)
+        data, error = self._line.ask(servo_id, INST_READ, parameters, BLOCK_SIZE, hasty=hasty, started=started)
         received_s = self.clock.now()
         self._refuse(servo_id, "reading its state", error)
         block = decode_block(data, alert=bool(error & 0x80), sent_s=sent_s, received_s=received_s)
@@ -242,7 +202,7 @@ class Bus:
     def agreed_block(self, servo_id: int) -> Block:
         """The later of two consecutive blocks that agree: same goal, and no farther apart than a servo can turn."""
         earlier = self.block(servo_id)
-        tries = 2 * self.attempts
+        tries = 2 * self._line.attempts
         for _ in range(tries):
             later = self.block(servo_id)
             moved = abs(later.position - earlier.position)
@@ -282,26 +242,20 @@ class Bus:
         DeviceTimeoutError
             If a servo cannot be reached; the others have been stopped.
         """
-        with self._lock:
-            self._port.is_using = False
-            order = sorted(self._members, key=lambda servo_id: servo_id in self._failing)
+        with self._line.lock:
+            order = sorted(self._members, key=lambda servo_id: servo_id in self._line.failing)
             late = [servo_id for servo_id in order if not self._stop(servo_id, hasty=True)]
             unreached = [servo_id for servo_id in late if not self._stop(servo_id, hasty=False)]
         if unreached:
             names = " and ".join(self.label(servo_id) for servo_id in unreached)
             raise DeviceTimeoutError(
-                f"{names} cannot be reached to be stopped; "
-                "cut the power of the servos if anything moves."
+                f"{names} cannot be reached to be stopped; cut the power of the servos if anything moves."
             )
 
     def _stop(self, servo_id: int, *, hasty: bool) -> bool:
         """Tell one servo to hold where it is; True if it said that it does."""
         member = self._members[servo_id]
         try:
-            if not hasty:  # a hasty question may still be answered
-                self._port.timeout_s = self.timeout_s
-                self._drain()
-                self._fence(servo_id)
             goal = member.clip(self.block(servo_id, hasty=hasty).position)
             self.write(servo_id, GOAL_POSITION, goal, hasty=hasty)
         except DeviceError as error:
@@ -314,104 +268,6 @@ class Bus:
         member.halted(goal)
         return True
 
-    # -- transactions
-
-    def _ask(
-        self,
-        servo_id: int,
-        instruction: int,
-        parameters: bytes,
-        length: int,
-        *,
-        hasty: bool = False,
-        started: Callable[[], None] = lambda: None,
-    ) -> tuple[bytes, int]:
-        """One instruction and its status: data of `length` bytes (or none with an error number), error byte.
-
-        A hasty one has a single short try and leaves the line as it is.
-        """
-        allowed = 1 if hasty else self.attempts
-        with self._lock:
-            self._port.timeout_s = min(self.timeout_s, _HASTY_TIMEOUT_S) if hasty else self.timeout_s
-            for attempt in range(1, allowed + 1):
-                started()
-                result, data, error = self._exchange(servo_id, instruction, parameters, length)
-                if result == COMM_SUCCESS:
-                    if error & 0x7F != _STATUS_CRC:
-                        self._failing.discard(servo_id)
-                        return data, error
-                    logger.info("%s got a damaged instruction, try %d", self.label(servo_id), attempt)
-                    result = COMM_RX_CORRUPT
-                    continue
-                self.timeouts += 1
-                logger.info("%s: no valid answer (%d), try %d", self.label(servo_id), result, attempt)
-                if hasty:
-                    break
-                self._drain()
-                if attempt < allowed and not self._fence(servo_id):
-                    break
-            self._failing.add(servo_id)
-        raise self._silence(servo_id, result)
-
-    def _exchange(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> tuple[int, bytes, int]:
-        """One try; the SDK's result, data, error byte. Answers of other servos or other lengths are passed over."""
-        with self._transaction():
-            self._sent(self._packets.transmit(self._port, servo_id, instruction, parameters, length))
-            while True:
-                packet, result = self._packets.rxPacket(self._port, False)
-                if result != COMM_SUCCESS:
-                    return result, b"", 0
-                count = (packet[LENGTH_AT] | packet[LENGTH_AT + 1] << 8) - 4  # instruction, error, CRC
-                error = packet[ERROR_AT]
-                # a status with an error number carries no data
-                if packet[ID_AT] == servo_id and count == (0 if error & 0x7F else length):
-                    return result, bytes(packet[PARAMETERS_AT : PARAMETERS_AT + count]), error
-                logger.info("port %s: passed over a stray answer of servo id %d", self.port_name, packet[ID_AT])
-
-    def _fence(self, servo_id: int) -> bool:
-        """After a timeout: True once the servo answers a question that no earlier one can have been."""
-        for _ in range(self.attempts):
-            self._fences += 1
-            length = _FENCE_LENGTHS[self._fences % len(_FENCE_LENGTHS)]
-            parameters = (0).to_bytes(2, "little") + length.to_bytes(2, "little")
-            result, data, error = self._exchange(servo_id, INST_READ, parameters, length)
-            if result == COMM_SUCCESS and not error & 0x7F and data[SERVO_ID.address] == servo_id:
-                return True
-            self._drain()
-        return False
-
-    def _drain(self) -> None:
-        """Read and discard until the line has been idle for `drain_s`."""
-        with self._lock, self._transaction():
-            start = quiet_since = self._now()
-            while self._now() - quiet_since < self.drain_s:
-                if self._port.readPort(256):
-                    quiet_since = self._now()
-                if self._now() - start > _DRAIN_LIMIT_S + self.drain_s:
-                    raise ProtocolError(
-                        f"Port {self.port_name} does not fall silent within {_DRAIN_LIMIT_S:.0f} s; "
-                        "check the baud rate and that no other program talks on the line."
-                    )
-
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        """Leave the port free, whatever happens in between (the SDK leaves it marked as in use)."""
-        if not self._port.is_open:
-            raise DeviceError(f"Port {self.port_name} is closed; open the bus first.")
-        self._port.is_using = False
-        try:
-            with port_errors(f"Port {self.port_name}"):
-                yield
-        finally:
-            self._port.is_using = False
-
-    def _sent(self, result: int) -> None:
-        if result != COMM_SUCCESS:
-            raise DeviceError(
-                f"Port {self.port_name} did not take an instruction ({self._packets.getTxRxResult(result)}); "
-                "reconnect the adapter and resume."
-            )
-
     def _refuse(self, servo_id: int, what: str, error: int) -> None:
         if error & 0x7F:
             reason = STATUS_ERRORS.get(error & 0x7F, f"unknown error {error & 0x7F}")
@@ -420,14 +276,3 @@ class Bus:
                 f"{', and it reports a hardware error' if error & 0x80 else ''}; "
                 "check its model, operating mode and limits in rig.toml."
             )
-
-    def _silence(self, servo_id: int, result: int) -> DeviceError:
-        if result == COMM_RX_CORRUPT:
-            return ProtocolError(
-                f"{self.label(servo_id)} answers in damaged packets at {self.baud} baud; "
-                "check the cable and that no two servos share the id."
-            )
-        return DeviceTimeoutError(
-            f"{self.label(servo_id)} gives no answer within {self._port.timeout_s:g} s at {self.baud} baud; "
-            "check its power, cable, id and baud rate."
-        )

@@ -122,6 +122,4 @@ def _write_checked(bus: Bus, servo_id: int, values: dict[reg.Register, int], rem
         bus.write(servo_id, register, value)
         found = bus.read(servo_id, register)
         if found != value:
-            raise DeviceError(
-                f"{bus.label(servo_id)} keeps {register.name} = {found}, {value} was written; {remedy}."
-            )
+            raise DeviceError(f"{bus.label(servo_id)} keeps {register.name} = {found}, {value} was written; {remedy}.")

@@ -85,8 +85,7 @@ class Port(PortHandler):  # type: ignore[misc]
         self._empty_reads += 1
         if self._empty_reads > _STUCK_READS and self._now() == self._empty_since:
             raise DeviceError(
-                f"Port {self.port_name}: the clock of the packet timeouts stands still; "
-                "give the bus the clock of its port."
+                f"Port {self.port_name}: the clock of the packet timeouts stands still; give the bus the clock of its port."
             )
         return data
 

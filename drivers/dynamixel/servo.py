@@ -6,8 +6,6 @@ every sign it gives. The goal is never reported as an angle. It never waits: `se
 leg of an approach. It does not know the rig's geometry, nor where the axis's true zero is, and it never takes torque off
 a loaded arm, except at `connect`, once, when a setting in EEPROM has to change.
 
-Angles [rad] and counts: ``counts = zero_counts + direction * angle * 4096 / (2 pi)``.
-
 References: ROBOTIS e-manual, XM430-W350 (emanual.robotis.com/docs/en/dxl/x/xm430-w350).
 """
 
@@ -20,14 +18,13 @@ from typing import Literal
 from drivers.dynamixel import registers as reg
 from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.commissioning import Settings, commission
+from drivers.dynamixel.joint import Joint
 from drivers.dynamixel.leg import Leg, Outcome
 from gonio.errors import ConfigurationError, DeviceError, LimitError, ProtocolError
 from gonio.interfaces import AxisLimits, AxisReading
 
 logger = logging.getLogger(__name__)
 
-_COUNTS_PER_RAD = reg.COUNTS_PER_TURN / (2.0 * math.pi)
-_ANGLE_SLACK = 1e-9  # rad; an angle computed from the limit in degrees is not beyond it
 _RESENDS = 2
 
 
@@ -92,29 +89,17 @@ class Servo:
         watchdog_s: float | None = None,
     ) -> None:
         self._bus = bus
-        self._name = name
         self._id = servo_id
-        self._zero = zero_counts
-        self._direction = direction
+        self._joint = Joint(name, zero_counts, direction, lower, upper, approach, overshoot, tolerance_counts)
         self._limits = AxisLimits(lower, upper, velocity)
-        self._approach = approach
-        self._overshoot_counts = round(overshoot * _COUNTS_PER_RAD)
-        self._tolerance = tolerance_counts
         self._settle_s = settle_s
         self._stall_s = stall_s
-        self._check_parameters(model, acceleration, overshoot, watchdog_s)
+        self._check_parameters(model, acceleration, watchdog_s)
         self._watchdog = 0 if watchdog_s is None else max(1, round(watchdog_s / reg.WATCHDOG_UNIT_S))
-        self._low_counts, self._high_counts = sorted((self._counts(lower), self._counts(upper)))
-        if self._low_counts < 0 or self._high_counts > reg.COUNTS_PER_TURN - 1:
-            raise ConfigurationError(
-                f"Axis {name}: limits {math.degrees(lower):g} to {math.degrees(upper):g} deg are counts "
-                f"{self._low_counts} to {self._high_counts}, the servo has 0 to {reg.COUNTS_PER_TURN - 1}; "
-                "narrow the limits or mount the horn so that zero_counts is near 2048."
-            )
         self._settings = Settings(
             reg.MODELS[model],
-            self._low_counts,
-            self._high_counts,
+            self._joint.low_counts,
+            self._joint.high_counts,
             max(1, int(velocity / reg.VELOCITY_UNIT)),
             max(1, int(acceleration / reg.ACCELERATION_UNIT)),
         )
@@ -129,39 +114,23 @@ class Servo:
         self._resends = 0
         bus.register(servo_id, self)
 
-    def _check_parameters(self, model: str, acceleration: float, overshoot: float, watchdog_s: float | None) -> None:
+    def _check_parameters(self, model: str, acceleration: float, watchdog_s: float | None) -> None:
         def refuse(text: str) -> ConfigurationError:
-            return ConfigurationError(f"Axis {self._name}: {text}")
+            return ConfigurationError(f"Axis {self.name}: {text}.")
 
         if not 0 <= self._id <= 252:
-            raise refuse(f"id {self._id} is outside 0 to 252.")
+            raise refuse(f"id {self._id} is outside 0 to 252")
         if model not in reg.MODELS:
-            raise refuse(f"model {model!r} is not known; one of {', '.join(reg.MODELS)}.")
-        if self._direction not in (1, -1):
-            raise refuse(f"direction {self._direction} must be 1 or -1.")
-        if self._approach not in ("up", "down", "any"):
-            raise refuse(f"approach {self._approach!r} must be up, down or any.")
-        if not self._limits.lower < self._limits.upper:
-            raise refuse(
-                f"lower limit {math.degrees(self._limits.lower):g} deg is not below "
-                f"upper limit {math.degrees(self._limits.upper):g} deg."
-            )
+            raise refuse(f"model {model!r} is not known; one of {', '.join(reg.MODELS)}")
         if not self._limits.velocity > 0.0 or not acceleration > 0.0:
             raise refuse(
                 f"velocity {math.degrees(self._limits.velocity):g} deg/s and acceleration "
-                f"{math.degrees(acceleration):g} deg/s^2 must be above 0 (0 would mean unlimited to the servo)."
+                f"{math.degrees(acceleration):g} deg/s^2 must be above 0 (0 would mean unlimited to the servo)"
             )
-        if self._approach != "any" and not (
-            overshoot >= math.radians(1.0) - _ANGLE_SLACK and self._overshoot_counts > self._tolerance
-        ):
-            raise refuse(
-                f"overshoot {math.degrees(overshoot):g} deg ({self._overshoot_counts} counts) must be at least 1 deg and "
-                f"more than the tolerance of {self._tolerance} counts, or the approach would not come from one side."
-            )
-        if not self._tolerance >= 0 or not self._settle_s > 0.0 or not self._stall_s > self._settle_s:
-            raise refuse("tolerance_counts must be 0 or more, and stall_s longer than settle_s, which is above 0.")
+        if not 0.0 < self._settle_s < self._stall_s:
+            raise refuse(f"settle_s = {self._settle_s:g} must be above 0 and below stall_s = {self._stall_s:g}")
         if watchdog_s is not None and not 0.0 < watchdog_s <= 127 * reg.WATCHDOG_UNIT_S:
-            raise refuse(f"watchdog {watchdog_s:g} s is outside 0 to 2.54 s.")
+            raise refuse(f"watchdog {watchdog_s:g} s is outside 0 to 2.54 s")
 
     # -- connection
 
@@ -176,16 +145,16 @@ class Servo:
         self._identity = commission(self._bus, self._id, self._settings)
         self._torque_on()
         self._connected = True
-        logger.info("axis %s connected: %s", self._name, self._identity)
+        logger.info("axis %s connected: %s", self.name, self._identity)
 
     def _torque_on(self) -> None:
         present = self._bus.agreed_block(self._id)
         holds = bool(self._read(reg.TORQUE_ENABLE))
         goal = self.clip(present.position)
-        if abs(goal - present.position) > self._tolerance:
+        if abs(goal - present.position) > self._joint.tolerance_counts:
             raise LimitError(
-                f"{self._label} stands at {self._degrees(present.position):.2f} deg, outside its limits of "
-                f"{self._limits_text}; {'switch its torque off and ' if holds else ''}turn it into them by hand, "
+                f"{self._label} stands at {self._at(present.position)}, outside its limits of "
+                f"{self._joint.limits_text}; {'switch its torque off and ' if holds else ''}turn it into them by hand, "
                 "or correct the limits."
             )
         if holds and not present.in_motion:
@@ -203,7 +172,7 @@ class Servo:
     @property
     def name(self) -> str:
         """Of the axis."""
-        return self._name
+        return self._joint.name
 
     @property
     def limits(self) -> AxisLimits:
@@ -218,41 +187,19 @@ class Servo:
         LimitError
             Outside the limits; nothing was sent.
         """
-        low, high = self._limits.lower, self._limits.upper
-        if not low - _ANGLE_SLACK <= angle <= high + _ANGLE_SLACK:
-            raise LimitError(
-                f"Axis {self._name} was asked for {math.degrees(angle):.3f} deg, its limits are {self._limits_text}; "
-                "nothing was sent: change the plan or the limits in rig.toml."
-            )
+        goal = self._joint.goal(angle)
         self._need_connection()
-        goal = self._counts(angle)
         if goal == self._goal:  # under way, or there
             return
-        legs = self._plan(goal, self._healthy(self._bus.block(self._id)))
+        present = self._healthy(self._bus.block(self._id)).position
+        legs, self._one_sided = self._joint.legs(present, goal, engaged=self._engaged and self._arrived)
+        if not self._one_sided:
+            logger.warning("axis %s: no room to approach %.2f deg from one side", self.name, self._joint.degrees(goal))
         if self._watchdog:
             self._disarm()
             self._write(reg.BUS_WATCHDOG, self._watchdog)
         self._begin(legs)
         self._write(reg.GOAL_POSITION, legs[0])
-
-    def _plan(self, goal: int, present: reg.Block) -> list[int]:
-        """Goals of the legs [counts]: one, or two if the direct way comes from the wrong side."""
-        self._one_sided = True
-        if self._approach == "any":
-            return [goal]
-        side = self._direction if self._approach == "up" else -self._direction  # sign of the final approach [counts]
-        travel = side * (goal - present.position)
-        if travel >= self._overshoot_counts or (travel >= 0 and self._engaged and self._arrived):
-            return [goal]
-        before = self.clip(goal - side * self._overshoot_counts)
-        if side * (goal - before) > self._tolerance:
-            return [before, goal]
-        self._one_sided = False
-        logger.warning(
-            "axis %s: %.2f deg is so near to a limit that the final approach cannot come from one side",
-            self._name, self._degrees(goal),
-        )  # fmt: skip
-        return [before, goal] if before != goal else [goal]
 
     def _begin(self, legs: list[int]) -> None:
         self._legs = legs
@@ -262,7 +209,7 @@ class Servo:
         self._start_leg()
 
     def _start_leg(self) -> None:
-        self._leg = Leg(self._legs[0], self._tolerance, self._settle_s, self._stall_s, self._bus.clock.now())
+        self._leg = Leg(self._legs[0], self._joint.tolerance_counts, self._settle_s, self._stall_s, self._bus.clock.now())
 
     def settled(self) -> bool:
         """Poll: True once the axis stands at its goal by every sign it can give.
@@ -307,7 +254,7 @@ class Servo:
     def _disarm(self) -> None:
         """Watchdog off. One that has tripped takes the profile with it: without it the next move would be a jerk."""
         if self._read(reg.BUS_WATCHDOG) < 0:
-            logger.warning("axis %s: the servo's watchdog had tripped", self._name)
+            logger.warning("axis %s: the servo's watchdog had tripped", self.name)
             self._write(reg.BUS_WATCHDOG, 0)
             self._write(reg.PROFILE_ACCELERATION, self._settings.profile_acceleration)
             self._write(reg.PROFILE_VELOCITY, self._settings.profile_velocity)
@@ -319,7 +266,7 @@ class Servo:
         if not self._read(reg.TORQUE_ENABLE):
             raise DeviceError(
                 f"{self._label} has lost its torque, as after a dip of its supply, at "
-                f"{self._degrees(block.position):.2f} deg; check power and cable, then connect again."
+                f"{self._at(block.position)}; check power and cable, then connect again."
             )
         if self._resends >= _RESENDS:
             raise ProtocolError(
@@ -327,7 +274,7 @@ class Servo:
                 "check that no other program moves it."
             )
         self._resends += 1
-        logger.warning("axis %s: goal %d instead of %d, sent again", self._name, block.goal, self._legs[0])
+        logger.warning("axis %s: goal %d instead of %d, sent again", self.name, block.goal, self._legs[0])
         self._write(reg.GOAL_POSITION, self._legs[0])
 
     def _give_up(self, block: reg.Block) -> None:
@@ -340,16 +287,16 @@ class Servo:
                 self._disarm()
             self.stop()
         except DeviceError as error:
-            logger.warning("axis %s: cannot be stopped after its stall: %s", self._name, error)
+            logger.warning("axis %s: cannot be stopped after its stall: %s", self.name, error)
         if tripped:
             raise DeviceError(
-                f"{self._label} was stopped by its own watchdog at {self._degrees(block.position):.2f} deg on the way to "
-                f"{self._degrees(goal):.2f} deg: the computer was silent too long; raise watchdog_s and resume."
+                f"{self._label} was stopped by its own watchdog at {self._at(block.position)} on the way to "
+                f"{self._at(goal)}: the computer was silent too long; raise watchdog_s and resume."
             )
         load = "" if math.isnan(current) else f" with {current:.2f} A"
         raise DeviceError(
-            f"{self._label} makes no progress for {self._stall_s:g} s: it stands at {self._degrees(block.position):.2f} deg"
-            f"{load}, its goal is {self._degrees(goal):.2f} deg; look for an obstacle, too heavy a load or a low supply."
+            f"{self._label} makes no progress for {self._stall_s:g} s: it stands at {self._at(block.position)}"
+            f"{load}, its goal is {self._at(goal)}; look for an obstacle, too heavy a load or a low supply."
         )
 
     def read(self) -> AxisReading:
@@ -363,10 +310,10 @@ class Servo:
         self._need_connection()
         block = self._healthy(self._bus.agreed_block(self._id))
         return AxisReading(
-            angle=self._angle(block.position),
+            angle=self._joint.angle(block.position),
             position_counts=block.position,
             goal_counts=block.goal,
-            velocity=self._direction * block.velocity * reg.VELOCITY_UNIT,
+            velocity=self._joint.direction * block.velocity * reg.VELOCITY_UNIT,
             moving=block.in_motion,
             temperature_c=float(block.temperature),
             voltage_v=block.voltage * reg.VOLTAGE_UNIT_V,
@@ -383,17 +330,17 @@ class Servo:
     def describe(self) -> dict[str, object]:
         """Identity and settings for the run's metadata (JSON-compatible)."""
         return {
-            "name": self._name,
+            "name": self.name,
             **self._identity,
-            "zero_counts": self._zero,
-            "direction": self._direction,
+            "zero_counts": self._joint.zero_counts,
+            "direction": self._joint.direction,
             "lower_deg": math.degrees(self._limits.lower),
             "upper_deg": math.degrees(self._limits.upper),
             "velocity_deg_s": math.degrees(self._settings.profile_velocity * reg.VELOCITY_UNIT),
             "acceleration_deg_s2": math.degrees(self._settings.profile_acceleration * reg.ACCELERATION_UNIT),
-            "approach": self._approach,
-            "overshoot_counts": self._overshoot_counts,
-            "tolerance_counts": self._tolerance,
+            "approach": self._joint.approach,
+            "overshoot_counts": self._joint.overshoot_counts,
+            "tolerance_counts": self._joint.tolerance_counts,
             "settle_s": self._settle_s,
             "watchdog_s": self._watchdog * reg.WATCHDOG_UNIT_S,
         }
@@ -408,7 +355,7 @@ class Servo:
 
     def clip(self, counts: int) -> int:
         """Nearest position within the limits [counts]."""
-        return min(max(counts, self._low_counts), self._high_counts)
+        return self._joint.clip(counts)
 
     def halted(self, goal: int) -> None:
         """The servo was told to hold `goal` [counts]; the move is off."""
@@ -416,30 +363,18 @@ class Servo:
         self._begin([goal])
         self._goal = None
 
-    # -- conversions
-
-    def _counts(self, angle: float) -> int:
-        return self._zero + self._direction * round(angle * _COUNTS_PER_RAD)
-
-    def _angle(self, counts: int) -> float:
-        return self._direction * (counts - self._zero) / _COUNTS_PER_RAD
-
-    def _degrees(self, counts: int) -> float:
-        return math.degrees(self._angle(counts))
-
-    def _current_a(self, block: reg.Block) -> float:
-        unit = self._settings.model.current_unit_a
-        return math.nan if unit is None else block.current * unit
+    # -- access
 
     @property
     def _label(self) -> str:
         return self._bus.label(self._id)
 
-    @property
-    def _limits_text(self) -> str:
-        return f"{math.degrees(self._limits.lower):g} to {math.degrees(self._limits.upper):g} deg"
+    def _at(self, counts: int) -> str:
+        return f"{self._joint.degrees(counts):.2f} deg"
 
-    # -- access
+    def _current_a(self, block: reg.Block) -> float:
+        unit = self._settings.model.current_unit_a
+        return math.nan if unit is None else block.current * unit
 
     def _read(self, register: reg.Register) -> int:
         return self._bus.read(self._id, register)
@@ -455,4 +390,4 @@ class Servo:
 
     def _need_connection(self) -> None:
         if not self._connected:
-            raise DeviceError(f"Axis {self._name} is not connected; call connect() first.")
+            raise DeviceError(f"Axis {self.name} is not connected; call connect() first.")
