@@ -5,6 +5,7 @@ The truths come from the simulator's own side of the line: its registers, its sh
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from gonio.interfaces import Axis
 from sim import port
 from sim.clock import VirtualClock
 from sim.dynamixel.bus import DynamixelBus
+from sim.dynamixel.control_table import XL330_M288, XL430_W250, Model
 from sim.dynamixel.faults import Fault
 from sim.dynamixel.servo import Servo as SimServo
 
@@ -399,3 +401,29 @@ def test_two_axes_with_one_id(bench: Bench) -> None:
     rig.servo()
     with pytest.raises(ConfigurationError, match="both have id 1"):
         rig.servo()
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_servo_set_to_answer_little_is_told_to_answer_everything(bench: Bench, level: int) -> None:
+    rig = bench()
+    rig.sim.write(68, bytes([level]), 0.0)
+    servo = rig.connected()
+    servo.move_to(20 * DEG)
+    rig.finish(servo)
+    assert rig.register(68, 1) == 2
+
+
+@pytest.mark.parametrize("model", [XL430_W250, XL330_M288], ids=lambda model: model.name)
+def test_the_smaller_models(bench: Bench, model: Model) -> None:
+    rig = bench(model=model)
+    servo = rig.connected(model=model.name)
+    servo.move_to(-20 * DEG)
+    rig.finish(servo)
+    reading = servo.read()
+    assert reading.angle == pytest.approx(-20 * DEG, abs=4 * COUNT)
+    assert math.isnan(reading.current_a) == (model is XL430_W250)  # it estimates load and has no current sensor
+
+
+def test_the_description_goes_into_json(bench: Bench) -> None:
+    text = json.dumps(bench().connected().describe(), allow_nan=False)
+    assert json.loads(text)["firmware"] > 0
