@@ -158,7 +158,9 @@ def _figures(
         slug = "".join(c if c.isascii() and c.isalnum() else "_" for c in name)[:40].strip("_")
         jobs.append((f"map_{number}_{slug}".rstrip("_"), caption, _map_job(one, name)))
     if samples is not None and len(samples):
-        known = content.brdf_from(truth)
+        terms = {name.rpartition(".")[0] for name in truth}
+        held = {} if posterior is None else posterior.fixed  # a truth need not repeat what the fit holds
+        known = content.brdf_from({n: v for n, v in held.items() if n.rpartition(".")[0] in terms} | dict(truth))
         band: list[BRDF] = []
         if posterior is not None:
             draws = posterior.thin(_BAND_DRAWS, np.random.default_rng(0))

@@ -349,6 +349,13 @@ def test_slice_draws_model_and_measurement_where_they_are(samples: BRDFSamples) 
     assert all("1/sr" in a.get_ylabel() for a in (figure.axes[0], figure.axes[3]))
 
 
+def test_truth_is_drawn_only_if_it_is_complete() -> None:
+    whole = content.brdf_from(TRUTH)
+    assert whole is not None and whole.parameters() == {n: v for n, v in TRUTH.items() if not n.startswith("shared.")}
+    assert content.brdf_from({"ggx.alpha": 0.2}) is None
+    assert content.brdf_from({"shared.scale": 0.004}) is None
+
+
 def test_samples_without_uncertainty_or_in_no_plane(tmp_path: Path) -> None:
     out = BRDFSamples.plain(0.6, 0.0, np.linspace(0.4, 0.9, 7), np.pi / 2, np.full(7, 0.1))
     assert is_drawn(style.png(slices.brdf_slices(out, paint())))
