@@ -174,9 +174,7 @@ def _overcast(along: Array) -> Array:
     return (1.0 + 2.0 * along) / 3.0
 
 
-_KINDS: dict[str, Callable[..., Source]] = {
-    f.__name__: f for f in (collimated, uniform, hemispherical, disk, overcast)
-}
+_KINDS: dict[str, Callable[..., Source]] = {f.__name__: f for f in (collimated, uniform, hemispherical, disk, overcast)}
 
 
 def kinds() -> dict[str, Callable[..., Source]]:

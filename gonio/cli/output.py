@@ -15,6 +15,7 @@ from typing import Any
 import click
 
 Progress = Callable[[int, int], None]
+logging.getLogger("gonio").addHandler(logging.NullHandler())  # a log goes to a run or nowhere
 
 
 class Output:
@@ -38,6 +39,8 @@ class Output:
             from rich.console import Console
 
             self._console = Console(highlight=False, quiet=self.as_json, soft_wrap=True)
+            if not self._console.is_terminal:
+                self._console.width = 160  # a file or a pipe has no edge
         return self._console
 
     def say(self, text: str) -> None:
@@ -51,10 +54,11 @@ class Output:
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table; the first column left, the others right."""
+        from rich.box import SIMPLE_HEAD
         from rich.table import Table
         from rich.text import Text
 
-        shown = Table(title=Text(title), title_justify="left")
+        shown = Table(title=Text(title), title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         for k, name in enumerate(header):
             shown.add_column(Text(name), justify="left" if k == 0 else "right", no_wrap=True)
         for row in rows:

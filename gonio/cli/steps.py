@@ -100,12 +100,12 @@ def fit(run: Run, output: Output, model: str, seed: int, **options: Any) -> Post
 
 def show_fit(output: Output, posterior: Posterior, truth: Mapping[str, float] | None = None) -> None:
     """Table of the parameters, with the truth where it is known, and whether the chains converged."""
-    header = ["parameter", *(["truth"] if truth is not None else []), "median", "68 % from", "to", "95 % from", "to"]
+    header = ["parameter", *(["truth"] if truth is not None else []), "estimate", "68 % interval", "95 % interval"]
     rows = []
     for name, s in posterior.summary().items():
-        numbers = [f"{s[key]:.5g}" for key in ("median", "q16", "q84", "q025", "q975")]
-        known = [f"{truth[name]:.5g}" if name in truth else ""] if truth is not None else []
-        rows.append([name, *known, *numbers])
+        known = [f"{truth[name]:.4g}" if name in truth else ""] if truth is not None else []
+        intervals = [f"{s[low]:.4g} to {s[high]:.4g}" for low, high in (("q16", "q84"), ("q025", "q975"))]
+        rows.append([name, *known, f"{s['median']:.4g}", *intervals])
     output.table(f"Fit of {posterior.model}", header, rows)
     output.say(describe_convergence(posterior))
 
