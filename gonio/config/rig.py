@@ -23,11 +23,24 @@ MODELS = ("XM430-W350", "XL430-W250", "XL330-M288")
 
 @dataclass(frozen=True)
 class BusConfig:
-    """The servos' line: port (a path, a pyserial URL or ``"sim"``), baud [bit/s], packet timeout in wall time [s]."""
+    """The servos' line.
+
+    Attributes
+    ----------
+    port : str
+        A path, a pyserial URL or ``"sim"``.
+    baud : int
+        [bit/s].
+    timeout_s : float
+        Of a packet, in wall time [s].
+    watchdog_s : float
+        A real servo stops by itself if it hears nothing for so long during a move [s]; 0 for never.
+    """
 
     port: str
     baud: int
     timeout_s: float
+    watchdog_s: float
 
 
 @dataclass(frozen=True)
@@ -173,6 +186,8 @@ class RigConfig:
         Rest after the axes have settled, for the arm to stop ringing [s].
     moved : float
         Largest change of a joint angle during an exposure [rad]; beyond it the pose is exposed again.
+    text : str
+        The document itself.
     """
 
     name: str
@@ -185,20 +200,29 @@ class RigConfig:
     lamp: LampConfig
     white: WhiteConfig
     sim: SimConfig | None
+    text: str = field(default="", repr=False, compare=False)
 
     @property
     def simulated(self) -> bool:
-        """Whether any device of the rig is the simulator's."""
-        return SIMULATED in (self.bus.port, self.camera.kind, self.lamp.port)
+        """Whether the rig is the simulator's; it is so in all its parts or in none."""
+        return self.bus.port == SIMULATED
 
 
 def load_rig(path: str | Path) -> RigConfig:
-    """Read a rig file; see `parse_rig`."""
-    return parse_rig(read_document(path), str(path))
+    """Read a rig file; see `parse_rig`. A scenario is looked for in the file's folder."""
+    return parse_rig(read_document(path), str(path), folder=Path(path).absolute().parent)
 
 
-def parse_rig(text: str, name: str = "rig.toml") -> RigConfig:
+def parse_rig(text: str, name: str = "rig.toml", *, folder: Path | None = None) -> RigConfig:
     """The rig that a text describes.
+
+    Parameters
+    ----------
+    text : str
+    name : str, optional
+        What messages call it.
+    folder : Path, optional
+        To which ``[sim] scenario`` is relative; by default the one in which the process runs.
 
     Raises
     ------
@@ -210,7 +234,7 @@ def parse_rig(text: str, name: str = "rig.toml") -> RigConfig:
     rig = root.table("rig")
     bus = root.table("bus")
     axes = root.table("axes")
-    sim = _sim(root.table("sim", required=False)) if "sim" in root else None
+    sim = _sim(root.table("sim", required=False), folder) if "sim" in root else None
     camera = _camera(root.table("camera"), sim)
     lamp = _lamp(root.table("lamp"))
     config = RigConfig(
@@ -222,12 +246,14 @@ def parse_rig(text: str, name: str = "rig.toml") -> RigConfig:
             port=bus.text("port"),
             baud=bus.integer("baud", 1_000_000, lower=9600, upper=4_500_000, unit="bit/s"),
             timeout_s=bus.number("timeout_s", 0.5, lower=0.005, upper=30.0, unit="s"),
+            watchdog_s=bus.number("watchdog_s", 1.0, lower=0.0, upper=2.54, unit="s"),
         ),
         axes={axis: _axis(axes.table(axis), axis) for axis in AXES},
         camera=camera,
         lamp=lamp,
         white=_white(root.table("white")),
         sim=sim,
+        text=text,
     )
     for table in (rig, bus, axes, root):
         table.finish()
@@ -357,12 +383,13 @@ def _white(table: Table) -> WhiteConfig:
     return config
 
 
-def _sim(table: Table) -> SimConfig:
+def _sim(table: Table, folder: Path | None) -> SimConfig:
+    scenario = table.text("scenario", "")
     config = SimConfig(
         speed=table.number("speed", 1.0, above=0.0, upper=1e4, unit="rig seconds per wall second"),
         seed=table.integer("seed", 1, lower=0, upper=2**53),
         process=table.flag("process", True),
-        scenario=table.text("scenario", "") or None,
+        scenario=str((folder or Path()) / scenario) if scenario else None,
         truth=table.table("truth", required=False).free(),
     )
     table.finish()
@@ -390,11 +417,10 @@ def _cross_checks(config: RigConfig, root: Table) -> None:
             f"= {math.degrees(config.white.arm):g} puts the light arm before the camera; it needs at least "
             f"{math.degrees(config.g_min):g} degrees (g_min_deg)",
         )  # fmt: skip
-    if (config.bus.port == SIMULATED) != (config.camera.kind == SIMULATED):
-        root.document.report(
-            "camera", "kind",
-            f'= "{config.camera.kind}" does not go with [bus] port = "{config.bus.port}"; a simulated camera needs the '
-            'simulated bus, and the reverse',
-        )  # fmt: skip
-    if config.lamp.port == SIMULATED and config.bus.port != SIMULATED:
-        root.document.report("lamp", "port", '= "sim" needs [bus] port = "sim" as well')
+    for section, key, value in (("camera", "kind", config.camera.kind), ("lamp", "port", config.lamp.port)):
+        if (value == SIMULATED) != config.simulated:
+            root.document.report(
+                section,
+                key,
+                f'= "{value}" does not go with [bus] port = "{config.bus.port}"; all three are "sim", or none is',
+            )
