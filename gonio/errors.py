@@ -15,7 +15,6 @@
     ├── ConvergenceError    5   carries ``best``, what was reached
     │   └── IntegrationError
     └── DatasetError        6   a file or a data set that cannot be read or trusted
-    InterruptedScan       130   not an error: the user stopped a scan
 
 A message has the thing, both numbers with their units, and what to do next.
 """
@@ -97,7 +96,3 @@ class DatasetError(GonioError):
     """A file or data set is damaged, of the wrong kind, or does not hold what is needed."""
 
     exit_code = 6
-
-
-class InterruptedScan(Exception):
-    """The user stopped a scan: motion is stopped, the data kept. Not an error; exit code 130."""

@@ -10,7 +10,7 @@ import click
 
 from gonio import __version__
 from gonio.cli.output import Output, fail
-from gonio.errors import EXIT_INTERRUPTED, GonioError, InterruptedScan
+from gonio.errors import EXIT_INTERRUPTED, GonioError
 
 # verb -> (module, attribute, line of help); nothing of it is imported for --help
 VERBS: dict[str, tuple[str, str, str]] = {
@@ -18,7 +18,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "init": ("gonio.cli.init", "init", "Write commented rig, plan, scene and fit files into a folder."),
     "rig": ("gonio.cli.rig", "rig", "Look after a rig: check."),
     "sim": ("gonio.cli.sim", "sim", "The simulated rig as a server for other programs."),
-    "scan": ("gonio.cli.scan", "scan", "Measure the poses of a plan."),
+    "scan": ("gonio.cli.scan", "scan_", "Measure the poses of a plan."),
     "resume": ("gonio.cli.scan", "resume", "Go on with an interrupted scan."),
     "verify": ("gonio.cli.scan", "verify", "Check journal and frames of a run."),
     "import": ("gonio.cli.importing", "import_", "Make a run from a measured file."),
@@ -85,10 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return fail(exc.format_message(), 2, as_json)
         exc.show()
         return 2
-    except (KeyboardInterrupt, click.Abort):
-        return fail("interrupted", EXIT_INTERRUPTED, as_json)
-    except InterruptedScan as exc:
-        return fail(str(exc), EXIT_INTERRUPTED, as_json)
+    except (KeyboardInterrupt, click.Abort) as exc:
+        told = exc.__cause__ if isinstance(exc, click.Abort) else exc  # click wraps Ctrl-C; a scan says what it kept
+        return fail(str(told or "") or "interrupted", EXIT_INTERRUPTED, as_json)
     except GonioError as exc:
         if debug:
             raise

@@ -18,6 +18,8 @@ from gonio.integrate.plan import Step
 @json_option
 def map_(scene: Path, out: Path, explain: bool, as_json: bool) -> None:
     """Compute R(p, q) of SCENE (scene.toml): the radiance seen by a viewer at +z against the surface's gradient."""
+    import numpy as np
+
     from gonio import jit
     from gonio.config import load_scene
 
@@ -27,7 +29,8 @@ def map_(scene: Path, out: Path, explain: bool, as_json: bool) -> None:
         source = steps.scene_source(config)
         made, values = steps.compute_map(
             output, "reflectance map", brdf, source,
-            p=config.p, q=config.q, n=config.n, rtol=config.rtol, posterior=posterior, attributes=origin,
+            np.linspace(*config.p, config.n), np.linspace(*config.q, config.n),
+            rtol=config.rtol, posterior=posterior, attributes=origin,
         )  # fmt: skip
         out.parent.mkdir(parents=True, exist_ok=True)
         made.save(out)

@@ -11,6 +11,9 @@ from gonio.cli.output import Output, log_to
 from gonio.errors import DatasetError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from gonio.brdf.base import BRDF
     from gonio.brdf.tabulated import TabulatedBRDF
     from gonio.config import SceneConfig
@@ -164,15 +167,17 @@ def compute_map(
     title: str,
     brdf: BRDF,
     source: Source,
+    p: NDArray[np.float64],
+    q: NDArray[np.float64] | None = None,
     *,
-    p: Sequence[float],
-    q: Sequence[float],
-    n: int,
     rtol: float,
     posterior: Posterior | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> tuple[ReflectanceMap, MapValues]:
-    """A map with its band, if there is a posterior; a tolerance that is not met is told, not hidden."""
+    """A map on the axes p and q (p again by default), with its band if there is a posterior.
+
+    A tolerance that is not met is told, not hidden.
+    """
     import numpy as np
 
     from gonio import maps
@@ -185,8 +190,8 @@ def compute_map(
         made, values = maps.compute(
             brdf,
             source,
-            np.linspace(p[0], p[1], n),
-            np.linspace(q[0], q[1], n),
+            p,
+            p if q is None else q,
             rtol=rtol,
             draws=draws,
             attributes={"source": repr(source), "rtol": f"{rtol:g}", **(attributes or {})},
