@@ -3,8 +3,8 @@ r"""From scattered BRDF samples to the nodes of a table: local regression with a
 Coordinates are functions that are smooth and single-valued for an isotropic, reciprocal, mirror-symmetric BRDF, so that
 no sample is torn from its neighbour at theta_h = 0 or theta_d = 0, where azimuths lose their meaning:
 
-.. math:: x_1 = \frac{\ln(1 + \tan^2(\theta_h/2)/c^2)}{\ln(1 + 1/c^2)},\quad x_2 = 1 - \cos\theta_d,\quad
-          x_3 = (\cos\theta_i - \cos\theta_r)^2 .
+.. math:: x_1 = \frac{\ln(1 + \tan^2(\theta_h/2)/c^2)}{\ln(1 + 1/c^2)},\quad
+          x_2 = \frac{\ln(1.1/(0.1+\cos\theta_d))}{\ln 11},\quad x_3 = (\cos\theta_i - \cos\theta_r)^2 .
 
 With c near half the roughness, the logarithm of a GGX lobe is a straight line in x_1. Around each node the nearest
 samples, weighted by distance [1]_ and by their variance, are fitted with ln f linear or quadratic in x by Fisher scoring on
@@ -32,10 +32,12 @@ from gonio.errors import DatasetError
 from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
-MOST = 20_000  # more samples than this are averaged in cells first
+MANY = 4_000  # more samples than this are averaged in cells of half a node step
+MOST = 20_000  # and in larger cells if more than this remain
+CLOUD = 32  # nearest samples that tell whether a node lies among them
 FEWEST = 12
 MISMATCH = 0.02  # relative error of a local polynomial that the weights allow for
-OUTSIDE = 4.0  # squared Mahalanobis distance from its neighbours beyond which a node is extrapolated
+OUTSIDE = 3.3  # squared distance from its neighbours' middle, in their variances, beyond which a node is extrapolated
 TRIALS = 400  # samples left out, one at a time, to choose the settings
 
 
@@ -56,17 +58,17 @@ class Local:
 
     eta: Array  # (m,)
     sigma: Array  # (m,)
-    outside: Array  # (m,) Mahalanobis distance squared of the target from the cloud of neighbours
+    outside: Array  # (m,) squared distance of the target from its neighbours' middle, in their variances
     nearest: Array  # (m,)
 
 
 def coordinates(omega_i: Array, omega_r: Array) -> Array:
-    """tan(theta_h/2), 1 - cos(theta_d) and (cos theta_i - cos theta_r)^2 of pairs of directions, shape (n, 3)."""
+    """tan(theta_h/2), x_2 and x_3 of pairs of directions, shape (n, 3)."""
     s, e = omega_i + omega_r, omega_i - omega_r
     length = np.linalg.norm(s, axis=-1)
     th = np.hypot(s[..., 0], s[..., 1]) / (length + s[..., 2])
-    # 1 - |s|/2 = |e|^2 / (4 + 2 |s|), without cancellation
-    return np.stack((th, np.sum(e * e, axis=-1) / (4.0 + 2.0 * length), e[..., 2] ** 2), axis=-1)
+    x_2 = np.log(1.1 / (0.1 + 0.5 * length)) / np.log(11.0)  # |s| = 2 cos(theta_d)
+    return np.stack((th, x_2, e[..., 2] ** 2), axis=-1)
 
 
 def grid_position(omega_i: Array, omega_r: Array) -> Array:
@@ -96,7 +98,7 @@ def regress(
         raise DatasetError(f"none of the {len(f)} samples is positive; check the dark frames and the quantity")
     u, known = _uncertainty(f, u)
     position = grid_position(omega_i, omega_r)
-    if len(f) > MOST:
+    if len(f) > MANY:
         x, f, u = _binned(x, f, u, position, shape)
     data = _Data(x, f, u, known)
 
@@ -119,14 +121,21 @@ def regress(
     local = Local(*(np.concatenate([getattr(part, n) for part in found]) for n in ("eta", "sigma", "outside", "nearest")))
 
     # outside its neighbours, or far from all of them: a straight line only, and an error that grows with the distance
-    spacing = data.spacing(settings)
-    far = (local.outside > OUTSIDE) | (local.nearest > 4.0 * spacing)
+    spacing = data.spacing(targets, settings)
+    cell = tuple(np.rint(position * (np.array(shape) - 1)).astype(np.int64).T)
+    measured = np.zeros(shape, dtype=bool)
+    measured[cell] = True
+    # where azimuth has no meaning, one sample measures the node at all of them
+    measured[0] |= measured[0].any(axis=-1, keepdims=True)
+    measured[:, 0] |= measured[:, 0].any(axis=-1, keepdims=True)
+    far = ((local.outside > OUTSIDE) & (local.nearest > 0.7 * spacing)) | (local.nearest > 4.0 * spacing)
+    far &= ~measured.ravel()
     eta, sigma = local.eta.copy(), scale * local.sigma * np.sqrt(1.0 + (local.nearest / spacing) ** 2 / 4.0)
     sigma *= _excess(data, settings, scale, targets)
     if np.any(far):
         straight = data.fit(targets[far], replace(settings, order=1, neighbours=max(settings.neighbours, 12)))
         eta[far] = straight.eta
-        beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing / 4.0
+        beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing[far] / 4.0
         sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, 0.2 + 0.3 * beyond)
     # standard deviation of a log-normal value over its median's: what is badly known may be far above
     sigma = np.minimum(sigma, 2.0)
@@ -135,17 +144,11 @@ def regress(
     value = np.exp(eta)
 
     coverage = np.where(far, tabulated.EXTRAPOLATED, tabulated.INTERPOLATED).astype(np.uint8)
-    cell = np.rint(position * (np.array(shape) - 1)).astype(np.int64)
-    coverage[tuple(cell.T)] = tabulated.MEASURED
-    # where azimuth has no meaning, one sample measures the node at all of them
-    for edge in (np.index_exp[0, :, :], np.index_exp[:, 0, :]):
-        touched = np.any(coverage[edge] == tabulated.MEASURED, axis=-1)
-        coverage[edge][touched] = tabulated.MEASURED
+    coverage[measured] = tabulated.MEASURED
     if fill is not None:
-        holes = far & (coverage != tabulated.MEASURED)
-        value[holes] = fill.evaluate(node_i[holes], node_r[holes])
-        relative_u = np.where(holes, _misfit(fill, samples, known), relative_u)
-        coverage[holes] = tabulated.MODEL
+        value[far] = fill.evaluate(node_i[far], node_r[far])
+        relative_u = np.where(far, _misfit(fill, samples, known), relative_u)
+        coverage[far] = tabulated.MODEL
     coverage[below] = tabulated.BELOW_HORIZON
     attributes = {
         **samples.attributes,
@@ -184,12 +187,12 @@ class _Data:
             self._tree = (key, cKDTree(points), points)
         return self._tree[1], self._tree[2]
 
-    def spacing(self, settings: Settings) -> float:
-        """Typical distance from a sample to its third neighbour."""
+    def spacing(self, targets: Array, settings: Settings) -> Array:
+        """Distance of samples near each target from their own third neighbour, the median of eight."""
         tree, points = self.tree(settings)
-        step = max(1, len(points) // 2000)
-        distance, _ = tree.query(points[::step], 4)  # type: ignore[attr-defined]
-        return max(float(np.median(distance[:, 3])), 1e-9)
+        distance, _ = tree.query(points, 4)  # type: ignore[attr-defined]
+        _, index = tree.query(self.metric(targets, settings), min(8, len(points)))  # type: ignore[attr-defined]
+        return np.maximum(np.median(distance[:, 3][index], axis=1), 1e-9)
 
     def fit(self, targets: Array, settings: Settings, leave_out: NDArray[np.int64] | None = None) -> Local:
         """Local fits at the targets (m, 3); with `leave_out`, target j ignores sample leave_out[j]."""
@@ -228,12 +231,21 @@ class _Data:
         center = np.clip(beta[:, 0], low[:, 0], high[:, 0])
         smoother = precision * np.einsum("mkp,mp->mk", design, first)
         variance = np.sum(smoother**2 * noise / (mu * mu), axis=1)
-        cloud = np.concatenate((z, np.zeros_like(z[:, :1])), axis=1)
+        return Local(center, np.sqrt(variance), self._outside(at, settings), distance[:, 0])
+
+    def _outside(self, at: Array, settings: Settings) -> Array:
+        """How far each target is from the middle of the samples around it, squared, in variances of their coordinates.
+
+        The larger of the worst coordinate's and half of all three's: 3 on a face or an edge of a full box.
+        """
+        tree, points = self.tree(settings)
+        distance, index = tree.query(at, min(CLOUD, len(points)))  # type: ignore[attr-defined]
+        z = (points[index] - at[:, None, :]) / (distance[:, -1:, None] + 1e-12)
         mean = z.mean(axis=1)
-        spread = np.einsum("mki,mkj->mij", cloud - mean[:, None], cloud - mean[:, None]) / cloud.shape[1]
-        spread += 1e-4 * np.eye(3)
-        outside = np.einsum("mi,mi->m", mean, np.linalg.solve(spread, mean[..., None])[..., 0])
-        return Local(center, np.sqrt(variance), outside, distance[:, 0])
+        spread = np.swapaxes(z, 1, 2) @ z / z.shape[1] - mean[:, :, None] * mean[:, None, :] + 1e-4 * np.eye(3)
+        every = np.einsum("mi,mi->m", mean, np.linalg.solve(spread, mean[..., None])[..., 0])
+        single = np.max(mean**2 / np.diagonal(spread, axis1=1, axis2=2), axis=1)
+        return np.asarray(np.maximum(single, every / 2.0))
 
 
 def _solve(design: Array, precision: Array, response: Array) -> tuple[Array, Array]:
@@ -293,7 +305,7 @@ def _choose(data: _Data) -> tuple[Settings, float]:
     inside = local.outside < OUTSIDE
     if np.count_nonzero(inside) < FEWEST:
         inside[:] = True
-    low, high = 0.3, 30.0
+    low, high = 0.6, 30.0
     for _ in range(40):
         middle = np.sqrt(low * high)
         pull = deviation / np.sqrt(noise**2 + (middle * mu * local.sigma) ** 2 + 1e-300)

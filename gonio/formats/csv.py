@@ -8,13 +8,15 @@
     30,0,45,180,0.25,0.0025
 
 An empty ``u_f_r`` means unknown; the column may be absent. Mirror direction at phi_r = phi_i + 180 degrees. Angles are
-written with as many digits as bring back the same radians bit for bit, at most 21. Shared errors and poses do not fit
+written with as many digits as bring back the same radians bit for bit: up to 17 where a float of degrees does, more (18 to
+21, which are converted in higher precision) where none exists. Shared errors and poses do not fit
 into six columns and stay in NetCDF; the header says so. A column that is not known is refused: rows of several
 wavelengths must not be mixed unseen.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from decimal import Decimal, localcontext
 from pathlib import Path
@@ -152,27 +154,38 @@ def _columns(cells: list[str], where: str) -> dict[str, int]:
 
 
 def _radians(text: str, where: str, cache: dict[str, float]) -> float:
-    """Correctly rounded radians of decimal degrees, so that a written angle comes back as it was."""
+    """Radians of decimal degrees, the inverse of `_degrees`."""
     if text not in cache:
         value = files.number(text, where)
         if abs(value) > 1e6:
             raise DatasetError(f"{where}: an angle of {value:g} degrees; angles must be in degrees within one turn")
-        with localcontext(prec=50):
-            cache[text] = float(Decimal(text) * RADIANS)
+        cache[text] = _long(text) if len(text.strip("-+").replace(".", "").lstrip("0")) > 17 else math.radians(value)
     return cache[text]
+
+
+def _long(text: str) -> float:
+    """Correctly rounded radians."""
+    with localcontext(prec=50):
+        return float(Decimal(text) * RADIANS)
 
 
 def _degrees(radians: float, cache: dict[float, str]) -> str:
     """The shortest of a few decimal degrees that gives these radians back."""
     if radians not in cache:
-        with localcontext(prec=50):
+        near = math.degrees(radians)
+        neighbours = (math.nextafter(near, 1e9), math.nextafter(near, -1e9))
+        for degrees in (float(f"{near:.6g}"), float(f"{near:.12g}"), near, *neighbours):
+            if math.radians(degrees) == radians:
+                plain = format(Decimal(repr(degrees)), "f")  # no exponents
+                cache[radians] = plain.rstrip("0").rstrip(".") if "." in plain else plain
+                return cache[radians]
+        with localcontext(prec=50):  # no float of degrees has these radians
             exact = Decimal(radians) / RADIANS
-            for digits in (6, 12, 15, 16, 17, 18, 19, 20, 21):
-                text = format(exact, f".{digits}g")
-                if float(Decimal(text) * RADIANS) == radians:
-                    break
-            plain = format(Decimal(text), "f")  # no exponents
-            cache[radians] = plain.rstrip("0").rstrip(".") if "." in plain else plain
+        for digits in (18, 19, 20, 21):
+            text = format(exact, f".{digits}g")
+            if _long(text) == radians:
+                break
+        cache[radians] = format(Decimal(text), "f")
     return cache[radians]
 
 

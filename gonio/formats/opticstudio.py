@@ -3,7 +3,8 @@
 A header of keywords with counts and angles in degrees, then ``DataBegin``, one block for each sample rotation and angle
 of incidence (``TIS`` and a row for each scatter azimuth with a column for each radial angle), and ``DataEnd``. Keywords are
 matched without case, as programs differ. Angles are relative to the specular direction: radial 0 is specular, azimuth 0
-runs from specular towards the normal, counter-clockwise seen against the specular ray.
+runs from specular towards the normal, counter-clockwise seen against the specular ray. Sample rotation turns the sample
+under a fixed light, so azimuths on the sample fall as it grows.
 
 An exact 0 stands for directions below the horizon and for directions that were never measured; both are left out and
 counted. All azimuths of radial 0 are one direction and give one sample. Transmission is refused, and of the three
@@ -66,7 +67,7 @@ def read(path: Path) -> BRDFSamples:
     y = np.broadcast_to(np.sin(az) * np.sin(r), x.shape)
     z = np.cos(a) * np.cos(r) + np.sin(a) * along
     theta_r, phi_r = angles(np.stack((x, y, z), axis=-1))  # (incidence, azimuth, radial)
-    turn = np.radians(np.array(rotation))[:, None, None, None]
+    turn = -np.radians(np.array(rotation))[:, None, None, None]  # the sample turns under fixed light
     shape = (len(rotation), *x.shape)
     values = data.reshape(shape)
     one = np.ones(x.shape, dtype=bool)
