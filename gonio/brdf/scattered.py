@@ -192,7 +192,7 @@ class _Data:
         tree, points = self.tree(settings)
         distance, _ = tree.query(points, 4)  # type: ignore[attr-defined]
         _, index = tree.query(self.metric(targets, settings), min(8, len(points)))  # type: ignore[attr-defined]
-        return np.maximum(np.median(distance[:, 3][index], axis=1), 1e-9)
+        return np.asarray(np.maximum(np.median(distance[:, 3][index], axis=1), 1e-9))
 
     def fit(self, targets: Array, settings: Settings, leave_out: NDArray[np.int64] | None = None) -> Local:
         """Local fits at the targets (m, 3); with `leave_out`, target j ignores sample leave_out[j]."""
