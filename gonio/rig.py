@@ -65,17 +65,21 @@ class Rig:
         ``"arm"``, ``"pan"``, ``"tilt"``.
     camera : Camera or None
     lamp : Lamp
+    simulator_pid : int or None
+        The process of a simulated rig that has one of its own.
     """
 
     def __init__(
         self, config: RigConfig, clock: Clock, bus: Bus, axes: Mapping[str, Axis], camera: Camera | None, lamp: Lamp,
         mount: Callable[[str], None], truth: Callable[[], Mapping[str, Any] | None],
+        simulator_pid: int | None = None,
     ) -> None:  # fmt: skip
         self.config = config
         self.clock = clock
         self.axes = dict(axes)
         self.camera = camera
         self.lamp = lamp
+        self.simulator_pid = simulator_pid
         self._bus = bus
         self._mount = mount
         self._mounted: str | None = None
@@ -275,7 +279,7 @@ def _served(config: RigConfig, sim: SimConfig, stack: ExitStack, faults: bool) -
     stack.callback(lamp.close)
     bus = Bus(ready["bus"], clock=clock, baud=config.bus.baud, timeout_s=config.bus.timeout_s)
     axes = _connect(bus, config, stack)
-    return Rig(config, clock, bus, axes, camera, lamp, camera.mount, camera.truth)
+    return Rig(config, clock, bus, axes, camera, lamp, camera.mount, camera.truth, int(ready["pid"]))
 
 
 def _start_simulator(config: RigConfig, sim: SimConfig, stack: ExitStack, faults: bool) -> dict[str, Any]:

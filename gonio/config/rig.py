@@ -389,7 +389,7 @@ def _sim(table: Table, folder: Path | None) -> SimConfig:
         speed=table.number("speed", 1.0, above=0.0, upper=1e4, unit="rig seconds per wall second"),
         seed=table.integer("seed", 1, lower=0, upper=2**53),
         process=table.flag("process", True),
-        scenario=str((folder or Path()) / scenario) if scenario else None,
+        scenario=str(((folder or Path()) / scenario).absolute()) if scenario else None,
         truth=table.table("truth", required=False).free(),
     )
     table.finish()

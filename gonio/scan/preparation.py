@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import platform
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,12 @@ POSES = "poses.json"
 
 
 def create_run(
-    path: str | Path, rig_text: str, plan_text: str, *, attributes: Mapping[str, str] | None = None
+    path: str | Path,
+    rig_text: str,
+    plan_text: str,
+    *,
+    attributes: Mapping[str, str] | None = None,
+    rig_folder: Path | None = None,
 ) -> tuple[Run, preflight.Preflight]:
     """Plan a scan, check it, and make its run; nothing moves.
 
@@ -36,6 +42,8 @@ def create_run(
         The documents, kept with the run.
     attributes : mapping of str to str, optional
         Further attributes of the run.
+    rig_folder : Path, optional
+        Where the rig file lies, to which its scenario is relative.
 
     Raises
     ------
@@ -44,7 +52,7 @@ def create_run(
     DatasetError
         If there is a run already.
     """
-    rig, config = parse_rig(rig_text), parse_plan(plan_text)
+    rig, config = parse_rig(rig_text, folder=rig_folder), parse_plan(plan_text)
     if rig.camera.kind == "none":
         raise ConfigurationError('[camera] kind = "none": a scan needs a camera; choose one in rig.toml')
     plan = make_plan(config, rig)
@@ -58,6 +66,7 @@ def create_run(
         "rig": rig.name,
         **{f"sample.{key}": value for key, value in config.sample.items()},
         **({"seed": str(rig.sim.seed)} if rig.sim and rig.simulated else {}),
+        **({"scenario": rig.sim.scenario} if rig.sim and rig.sim.scenario else {}),
         **(attributes or {}),
     }
     documents = {"rig.toml": rig_text, "plan.toml": plan_text, POSES: plan.to_json()}
@@ -68,7 +77,9 @@ def rig_of(run: Run) -> RigConfig:
     """The rig with which a run was begun, from its own documents."""
     if run.kind != "scan":
         raise DatasetError(f"{run.path} was imported, it has no rig and no plan; nothing to scan or resume")
-    return parse_rig(run.document("rig.toml"), f"{run.path}/rig.toml")
+    rig = parse_rig(run.document("rig.toml"), f"{run.path}/rig.toml")
+    scenario = run.attributes.get("scenario")  # the file itself may have been relative to another folder
+    return replace(rig, sim=replace(rig.sim, scenario=scenario)) if rig.sim and scenario else rig
 
 
 def plan_of(run: Run) -> tuple[PlanConfig, Plan]:

@@ -46,7 +46,7 @@ repeats = 2
 
 
 def begin(path: Path, *, rig: str = RIG, plan: str = PLAN) -> Run:
-    return create_run(path, rig, plan)[0]
+    return create_run(path, rig, plan, rig_folder=path.parent)[0]
 
 
 def whole_scan(path: Path) -> Run:
@@ -189,7 +189,7 @@ def test_kill_9_in_the_middle_of_a_scan(tmp_path: Path) -> None:
 
 def with_fault(tmp_path: Path, fault: str) -> str:
     (tmp_path / "faults.toml").write_text("[[fault]]\n" + fault)
-    return RIG.replace("[sim]", f'[sim]\nscenario = "{tmp_path}/faults.toml"')
+    return RIG.replace("[sim]", '[sim]\nscenario = "faults.toml"')
 
 
 @pytest.mark.parametrize(
@@ -286,9 +286,9 @@ def test_refusals_before_anything_moves(finished: Run, tmp_path: Path) -> None:
         pytest.raises(DatasetError, match="imported"),
     ):
         rig_of(run)
-    with begin(tmp_path / "locked") as run, open_rig(rig_of(run)) as rig, Run.open(run.path).lock():
-        with pytest.raises(DatasetError, match=f"being scanned by process {os.getpid()}"):
-            scan(run, rig)
+    refused = pytest.raises(DatasetError, match=f"being scanned by process {os.getpid()}")
+    with begin(tmp_path / "locked") as run, open_rig(rig_of(run)) as rig, run.lock(), refused:
+        scan(run, rig)
 
 
 def test_white_blocks_in_between(tmp_path: Path) -> None:
