@@ -153,7 +153,7 @@ def advice(
     for name, value in contractions.items():
         if value < CONTRACTION_LIMIT:
             said.append(
-                f"the data hardly constrain {name} (contraction {value:.2f}): its interval is that of the prior; measure "
+                f"the data hardly constrain {name} (contraction {max(value, 0.0):.2f}): its interval is that of the prior; measure "
                 "where it matters, or fix it"
             )
     if acceptance < 0.05:

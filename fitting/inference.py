@@ -106,13 +106,12 @@ def fit(
     options: dict[str, Any] = {"free": tuple(free), "fix": dict(fix or {}), "priors": dict(priors or {}), "shared": shared}
     problem = Problem(samples, models, discrepancy=bool(discrepancy), **options)
     modes = optimum.find(problem, np.random.default_rng(first))
-    stated = chi2_per_n = _chi2_per_n(problem, modes[0].u)
+    stated = _chi2_per_n(problem, modes[0].u, stated=True)
     unknown = np.isnan(samples.u_f_r)
-    inflate = discrepancy is None and chi2_per_n > misfit_limit(len(samples)) and not unknown.all()
+    inflate = discrepancy is None and stated > misfit_limit(len(samples)) and not unknown.all()
     if inflate and "noise.discrepancy" not in options["fix"]:
         problem = Problem(samples, models, discrepancy=True, **options)
         modes = optimum.find(problem, np.random.default_rng(first))
-        chi2_per_n = _chi2_per_n(problem, modes[0].u)
     chains = sample.run(
         problem.log_probability,
         modes,
@@ -154,7 +153,7 @@ def fit(
         "rhat": dict(zip(names, map(float, chains.rhat), strict=True)),
         "acceptance": chains.acceptance,
         "chi2_per_n": stated,
-        "chi2_per_n_with_discrepancy": chi2_per_n if inferred else None,
+        "chi2_per_n_with_discrepancy": _chi2_per_n(problem, modes[0].u, stated=False) if inferred else None,
         "n_samples": len(samples),
         "n_samples_given": given,
         "n_parameters": len(names),
@@ -178,9 +177,9 @@ def fit(
     return Posterior(model, names, draws, log_probability, dict(problem.space.fixed), diagnostics)
 
 
-def _chi2_per_n(problem: Problem, u: Array) -> float:
-    """chi^2 / N at a point, with the variances as they are there."""
-    _, chi2 = problem.log_likelihood(problem.space.natural(u[None])[0])
+def _chi2_per_n(problem: Problem, u: Array, *, stated: bool) -> float:
+    """chi^2 / N at a point, with or without the model's discrepancy in the variances."""
+    _, chi2 = problem.log_likelihood(problem.space.natural(u[None])[0], stated=stated)
     return float(chi2[0]) / len(problem.samples)
 
 

@@ -43,11 +43,13 @@ RELATIVE, ABSOLUTE, DISCREPANCY = "noise.relative", "noise.absolute", "noise.dis
 
 
 def _directions(base, slope, full, offset, varied, step, out):  # type: ignore[no-untyped-def]
-    """Perturbed unit vectors: base (6, n), slope (k, 6, n) -> out (w, 1 + v, 6, n).
+    """Perturbed unit vectors: base (6, n), slope (k, 6, n) -> out (w, 1 + v, 6, n); out[:, 0] holds the deltas, out[:, 1:]
+    one more step of one shared error each, renormalised to first order in the step.
 
     A direction that was measured was above the horizon, so z stays positive.
     """
     n = base.shape[1]
+    inverse, along = np.empty(n), np.empty(n)  # loops of few arrays each: the compiler vectorises those
     for w in range(out.shape[0]):
         raw = out[w, 0]
         raw[:] = base
@@ -55,22 +57,30 @@ def _directions(base, slope, full, offset, varied, step, out):  # type: ignore[n
             delta = full[w, offset + k]
             if delta != 0.0:
                 for c in range(6):
+                    to, by = raw[c], slope[k, c]
                     for j in range(n):
-                        raw[c, j] += delta * slope[k, c, j]
-        for v in range(varied.size):
-            shifted, change = out[w, v + 1], slope[varied[v]]
-            for c in range(6):
+                        to[j] += delta * by[j]
+        for c in (0, 3):
+            x, y, z = raw[c], raw[c + 1], raw[c + 2]
+            for j in range(n):
+                z[j] = max(z[j], 1e-9)
+            for j in range(n):
+                inverse[j] = 1.0 / math.sqrt(x[j] * x[j] + y[j] * y[j] + z[j] * z[j])
+            for i in (c, c + 1, c + 2):
+                to = raw[i]
                 for j in range(n):
-                    shifted[c, j] = raw[c, j] + step * change[c, j]
-        for v in range(out.shape[1]):
-            for c in (0, 3):
-                x, y, z = out[w, v, c], out[w, v, c + 1], out[w, v, c + 2]
+                    to[j] *= inverse[j]
+            for v in range(varied.size):
+                dx, dy, dz = slope[varied[v], c], slope[varied[v], c + 1], slope[varied[v], c + 2]
                 for j in range(n):
-                    z[j] = max(z[j], 1e-9)
-                    r = 1.0 / math.sqrt(x[j] * x[j] + y[j] * y[j] + z[j] * z[j])
-                    x[j] *= r
-                    y[j] *= r
-                    z[j] *= r
+                    along[j] = x[j] * dx[j] + y[j] * dy[j] + z[j] * dz[j]
+                for i in (c, c + 1, c + 2):
+                    to, at, by = out[w, v + 1, i], raw[i], slope[varied[v], i]
+                    for j in range(n):
+                        to[j] = at[j] + step * inverse[j] * (by[j] - along[j] * at[j])
+                to = out[w, v + 1, c + 2]
+                for j in range(n):
+                    to[j] = max(to[j], 1e-12)
 
 
 def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_sample, step, u2, unknown, mean, var):  # type: ignore[no-untyped-def]
@@ -278,9 +288,14 @@ class Problem:
         parts = [self._moments_of(full, i) for i in range(len(self._blocks))]
         return np.concatenate([m for m, _ in parts], axis=1), np.concatenate([v for _, v in parts], axis=1)
 
-    def log_likelihood(self, x: Array) -> tuple[Array, Array]:
-        """ln L (up to a constant; -inf where it is not finite) and chi^2, each (w,), for free parameters x, (w, d)."""
+    def log_likelihood(self, x: Array, *, stated: bool = False) -> tuple[Array, Array]:
+        """ln L (up to a constant; -inf where it is not finite) and chi^2, each (w,), for free parameters x, (w, d).
+
+        `stated` leaves the model's discrepancy out of the variances.
+        """
         full = self.space.full(x)
+        if stated:
+            full[:, self._noise + 2] = 0.0
         total, chi2 = np.zeros(len(full)), np.zeros(len(full))
         for i, (block, _) in enumerate(self._blocks):
             mean, var = self._moments_of(full, i)

@@ -23,8 +23,8 @@ from gonio.errors import ConvergenceError
 Array = NDArray[np.float64]
 LN_WIDTHS = (-4.0, -3.0, -2.0, -1.0)
 PRIOR_DRAWS = 256
-WIDEST = 3.0  # sd given to a direction of u that nothing determines; a logit with a flat prior has sd 1.8
-_EDGE = 15.0  # least squares keeps |u| below: 3e-7 of a range from its end
+WIDEST = 1.5
+_EDGE = 6.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _weights(problem: Problem) -> Array:
 
 
 def _residuals(problem: Problem, u: Array) -> Array:
-    """(w, n + d): weighted residuals and the pull of the priors on shared errors; a weak pull holds logits together."""
+    """(w, n + d): weighted residuals and the pull of the priors on shared errors; a weak pull keeps the others finite."""
     x, _ = problem.space.natural(u)
     pull = np.where([name.startswith("shared.") for name in problem.space.names], 1.0, 0.05)
     residual = (problem.samples.f_r - problem.predict(x)[0]) * _weights(problem)

@@ -2,12 +2,13 @@ r"""The parameters of a fit: which are free, which are held, and the unbounded c
 
 A parameter of the model, a shared error and a noise term are treated alike. A bounded parameter x is walked as
 
-.. math:: u = \operatorname{logit}\frac{g(x)-g(a)}{g(b)-g(a)}, \qquad g(x) = x \text{ or } \ln x,
+.. math:: u = \Phi^{-1}\frac{g(x)-g(a)}{g(b)-g(a)}, \qquad g(x) = x \text{ or } \ln x,
 
-the logarithm where the prior is one of a scale; an unbounded one as ``u = (x - mean) / sd`` of its normal prior. A
-half-normal one, as of a noise that enters squared, is folded: ``x = a + sd |u|``, so a noise of about zero is the middle of
-a hill and not the end of a long tail. The density of u holds the Jacobian dx/du, so the posterior of x does not depend on
-the choice.
+with the normal distribution function Phi: a uniform prior becomes N(0, 1), and a posterior at an edge gets a Gaussian tail
+(that of a logit is exponential and took up to twice the steps). g is the logarithm where the prior is one of a scale. An
+unbounded parameter is walked as ``u = (x - mean) / sd`` of its normal prior. A half-normal one, as of a noise that enters
+squared, is folded: ``x = a + sd |u|``, so a noise of about zero is the middle of a hill and not the end of a long tail.
+The density of u holds the Jacobian dx/du, so the posterior of x does not depend on the choice.
 
 This module knows names, ranges and priors, but no data.
 """
@@ -28,7 +29,8 @@ from gonio.brdf import Model, term_names
 from gonio.errors import ParameterError
 
 Array = NDArray[np.float64]
-_AFFINE, _LOGIT, _LOGIT_OF_LN, _FOLDED = range(4)
+_AFFINE, _PROBIT, _PROBIT_OF_LN, _FOLDED = range(4)
+_SQRT_HALF = math.sqrt(0.5)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def declare(models: Sequence[Model]) -> list[Declared]:
 def _form(q: Prior) -> int:
     if q.kind == "half_normal":
         return _FOLDED
-    return _AFFINE if not q.bounded else _LOGIT_OF_LN if q.logarithmic else _LOGIT
+    return _AFFINE if not q.bounded else _PROBIT_OF_LN if q.logarithmic else _PROBIT
 
 
 def _forward(u, form, lower, upper, code, a, b, x, log_prior):  # type: ignore[no-untyped-def]
@@ -86,11 +88,9 @@ def _forward(u, form, lower, upper, code, a, b, x, log_prior):  # type: ignore[n
                 if value > upper[i]:
                     total = -math.inf
             else:
-                # sigma(u) and ln(sigma (1 - sigma)) without overflow
-                e = math.exp(-abs(u[w, i]))
-                total += -abs(u[w, i]) - 2.0 * math.log1p(e)
-                s = 1.0 / (1.0 + e) if u[w, i] >= 0.0 else e / (1.0 + e)
-                if form[i] == _LOGIT:
+                s = 0.5 * math.erfc(-u[w, i] * _SQRT_HALF)  # Phi(u)
+                total -= 0.5 * u[w, i] * u[w, i]  # ln dPhi/du
+                if form[i] == _PROBIT:
                     value = lower[i] + (upper[i] - lower[i]) * s
                     log_x = math.log(value) if code[i] == LOG_NORMAL or code[i] == LOG_UNIFORM else 0.0
                 else:
@@ -212,6 +212,8 @@ class Space:
 
     def unbounded(self, x: Array) -> Array:
         """Coordinates u of natural values, shape (w, d); values on an edge end 1e-9 of the range inside."""
+        from scipy.special import ndtri
+
         x = np.asarray(x, dtype=float)
         u = np.empty_like(x)
         for i, q in enumerate(self.priors):
@@ -221,12 +223,11 @@ class Space:
             if self._form[i] == _FOLDED:
                 u[:, i] = (x[:, i] - q.lower) / q.b
                 continue
-            if self._form[i] == _LOGIT:
+            if self._form[i] == _PROBIT:
                 s = (x[:, i] - q.lower) / (q.upper - q.lower)
             else:
                 s = np.log(np.maximum(x[:, i], q.lower) / q.lower) / math.log(q.upper / q.lower)
-            s = np.clip(s, 1e-9, 1.0 - 1e-9)
-            u[:, i] = np.log(s) - np.log1p(-s)
+            u[:, i] = ndtri(np.clip(s, 1e-9, 1.0 - 1e-9))
         return u
 
     def full(self, x: Array) -> Array:

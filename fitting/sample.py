@@ -62,7 +62,7 @@ class Rule:
     drift: float = 0.02
     first: int = 200
     growth: float = 1.15
-    max_steps: int = 6000
+    max_steps: int = 10000
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,9 @@ References
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -151,30 +149,25 @@ class Posterior:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file: complete under its name, or not at all."""
+        from gonio.formats.files import replace_atomically
+
+        replace_atomically(Path(path), self._write)
+
+    def _write(self, path: Path) -> None:
         import h5netcdf
 
-        target = Path(path)
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        os.close(handle)
-        try:
-            with h5netcdf.File(temporary, "w") as file:
-                file.attrs["format"] = FORMAT
-                file.attrs["model"] = self.model
-                file.attrs["names"] = json.dumps(list(self.names))
-                file.attrs["fixed"] = json.dumps(dict(self.fixed), sort_keys=True)
-                file.attrs["diagnostics"] = json.dumps(self.diagnostics, sort_keys=True, allow_nan=False)
-                units = self.diagnostics.get("units")
-                self._write_group(file, "posterior", dict(zip(self.names, np.moveaxis(self.draws, 2, 0), strict=True)))
-                self._write_group(file, "sample_stats", {"lp": self.log_probability})
-                for name, unit in units.items() if isinstance(units, Mapping) else ():
-                    if name in self.names:
-                        file["posterior"][name].attrs["units"] = str(unit)
-            with Path(temporary).open("rb+") as written:
-                os.fsync(written.fileno())
-            Path(temporary).replace(target)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                Path(temporary).unlink()
+        with h5netcdf.File(path, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["model"] = self.model
+            file.attrs["names"] = json.dumps(list(self.names))
+            file.attrs["fixed"] = json.dumps(dict(self.fixed), sort_keys=True)
+            file.attrs["diagnostics"] = json.dumps(self.diagnostics, sort_keys=True, allow_nan=False)
+            self._write_group(file, "posterior", dict(zip(self.names, np.moveaxis(self.draws, 2, 0), strict=True)))
+            self._write_group(file, "sample_stats", {"lp": self.log_probability})
+            units = self.diagnostics.get("units")
+            for name, unit in units.items() if isinstance(units, Mapping) else ():
+                if name in self.names:
+                    file["posterior"][name].attrs["units"] = str(unit)
 
     def _write_group(self, file: Any, name: str, variables: Mapping[str, Array]) -> None:
         group = file.create_group(name)
