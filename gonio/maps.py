@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import BRDF
 from gonio.errors import DatasetError, IntegrationError, ParameterError
+from gonio.files import replace_atomically
 from gonio.integrate import MapValues, reflectance_map
 from gonio.source import Source
 
@@ -82,12 +83,8 @@ class ReflectanceMap:
             "attributes": json.dumps(dict(self.attributes)),
         }
         target = Path(path)
-        partial = target.with_name(f".{target.name}.{os.getpid()}.part")
-        try:
-            xr.Dataset(data, coordinates, attributes).to_netcdf(partial, engine="h5netcdf")
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+        data_set = xr.Dataset(data, coordinates, attributes)
+        replace_atomically(target, lambda temporary: data_set.to_netcdf(temporary, engine="h5netcdf"))
         return target
 
     @classmethod

@@ -149,7 +149,7 @@ class Posterior:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file: complete under its name, or not at all."""
-        from gonio.formats.files import replace_atomically
+        from gonio.files import replace_atomically
 
         replace_atomically(Path(path), self._write)
 

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gonio import files
 from gonio.errors import ConfigurationError, DatasetError
-from gonio.formats import cornell, csv, files, merl, netcdf, opticstudio, quantity
+from gonio.formats import cornell, csv, merl, netcdf, opticstudio, quantity
 from gonio.samples import BRDFSamples
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gonio import files
 from gonio.errors import DatasetError
-from gonio.formats import files
 from gonio.samples import BRDFSamples
 
 MOST_WAVELENGTHS = 2000

@@ -23,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gonio import files
 from gonio.errors import DatasetError
-from gonio.formats import files, quantity
+from gonio.formats import quantity
 from gonio.samples import BRDFSamples
 
 COLUMNS = ("theta_i_deg", "phi_i_deg", "theta_r_deg", "phi_r_deg", "f_r", "u_f_r")

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gonio import files
 from gonio.brdf.base import BRDF
 from gonio.errors import ConfigurationError, DatasetError
-from gonio.formats import files
 from gonio.halfdiff import directions
 from gonio.samples import BRDFSamples
 

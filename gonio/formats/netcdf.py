@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import gonio
+from gonio import files
 from gonio.errors import DatasetError
-from gonio.formats import files
 from gonio.samples import BRDFSamples, SharedError
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gonio import files
 from gonio.errors import DatasetError
-from gonio.formats import files
 from gonio.geometry import angles
 from gonio.samples import BRDFSamples
 

@@ -12,8 +12,6 @@ import hashlib
 import html
 import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gonio.errors import DatasetError
+from gonio.files import replace_atomically
 from gonio.report import style
 
 if TYPE_CHECKING:
@@ -145,19 +144,9 @@ def write_report(
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: a temporary file in the same folder, flushed to disk, then renamed."""
+    """Write a file whole or not at all, its folder made if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(name).chmod(0o644)  # mkstemp gives 0600: a report is to be read
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    replace_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
 def shown(value: Cell) -> str:
