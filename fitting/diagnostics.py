@@ -153,8 +153,8 @@ def advice(
     for name, value in contractions.items():
         if value < CONTRACTION_LIMIT:
             said.append(
-                f"the data hardly constrain {name} (contraction {max(value, 0.0):.2f}): its interval is that of the prior; measure "
-                "where it matters, or fix it"
+                f"the data hardly constrain {name} (contraction {max(value, 0.0):.2f}): its interval is the prior's; "
+                "measure where it matters, or fix it"
             )
     if acceptance < 0.05:
         said.append(f"only {acceptance:.1%} of the moves were accepted: the posterior is hard to walk, see the corner plot")
