@@ -41,7 +41,7 @@ def scan_(plan: Path, rig_file: Path, out: Path, dry_run: bool, as_json: bool) -
         if dry_run:
             output.result(**checked.as_dict())
             return
-        run, _ = create_run(out, rig_text, plan_text)
+        run, _ = create_run(out, rig_text, plan_text, rig_folder=rig_file.absolute().parent)
         with run:
             measure(run, output)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,11 +105,15 @@ def fit(run: Run, output: Output, model: str, seed: int, **options: Any) -> Post
 def show_fit(output: Output, posterior: Posterior, truth: Mapping[str, float] | None = None) -> None:
     """Table of the parameters, with the truth where it is known, and whether the chains converged."""
     header = ["parameter", *(["truth"] if truth is not None else []), "estimate", "68 % interval", "95 % interval"]
+    units = posterior.diagnostics.get("units") or {}
     rows = []
     for name, s in posterior.summary().items():
-        known = [f"{truth[name]:.4g}" if name in truth else ""] if truth is not None else []
-        intervals = [f"{s[low]:.4g} to {s[high]:.4g}" for low, high in (("q16", "q84"), ("q025", "q975"))]
-        rows.append([name, *known, f"{s['median']:.4g}", *intervals])
+        # an angle is shown in degrees, as everything at the user's edge
+        degrees = units.get(name) == "rad"
+        scale = math.degrees(1.0) if degrees else 1.0
+        known = [f"{scale * truth[name]:.4g}" if name in truth else ""] if truth is not None else []
+        intervals = [f"{scale * s[low]:.4g} to {scale * s[high]:.4g}" for low, high in (("q16", "q84"), ("q025", "q975"))]
+        rows.append([name + (" [deg]" if degrees else ""), *known, f"{scale * s['median']:.4g}", *intervals])
     output.table(f"Fit of {posterior.model}", header, rows)
     output.say(describe_convergence(posterior))
 

@@ -157,7 +157,7 @@ def _panel(
         low, high = float(np.nanmin(value)), float(np.nanmax(value))
         axes.set_facecolor(matplotlib.colormaps[palette](0.1, alpha=0.5))
         text = f"{low:.3g} to {high:.3g}" if high - low > 1e-6 * abs(high) else f"{high:.6g}"
-        axes.text(0.5, 0.5, f"everywhere {text}", transform=axes.transAxes, ha="center", va="center")
+        axes.text(0.5, 0.85, f"everywhere {text}", transform=axes.transAxes, ha="center", va="center")
     if dark.any() and not dark.all():
         axes.contourf(p, q, dark.astype(float), levels=[0.5, 1.5], colors=[style.PALE], zorder=1.5)
     if len(one.sources) == 1 and dark.any():
