@@ -11,6 +11,7 @@ of the model, ``noise.discrepancy``, is inferred as well, unless the caller forb
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from fitting import optimum, sample
 from fitting.diagnostics import advice, contraction, misfit_limit
 from fitting.likelihood import Problem
 from gonio import brdf
+from gonio.errors import ParameterError
 from gonio.posterior import Posterior
 from gonio.samples import BRDFSamples
 
@@ -91,12 +93,14 @@ def fit(
     >>> theta_i = np.linspace(0.1, 1.2, 40)
     >>> white = BRDFSamples.plain(theta_i, 0.0, 0.3, 1.0, np.full(40, 0.5 / np.pi), np.full(40, 0.003))
     >>> paper = fit(white, "lambertian", seed=1).summary()["lambertian.albedo"]
-    >>> abs(paper["mean"] - 0.5) < paper["sd"] and abs(paper["sd"] / (0.003 * np.pi / np.sqrt(40)) - 1) < 0.05
+    >>> bool(abs(paper["mean"] - 0.5) < paper["sd"] and abs(paper["sd"] / (0.003 * np.pi / np.sqrt(40)) - 1) < 0.05)
     True
     """
     rule = rule or sample.Rule()
     if max_steps is not None:
-        rule = sample.Rule(**(rule.__dict__ | {"max_steps": max_steps}))
+        rule = replace(rule, max_steps=max_steps)
+    if seed < 0:
+        raise ParameterError(f"seed = {seed} is negative; choose a whole number from 0 up")
     models = brdf.parse(model)
     first, second = (int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2))
     given = len(samples)

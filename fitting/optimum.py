@@ -177,7 +177,7 @@ def _climb(problem: Problem, u: Array, iterations: int = 60) -> Mode | None:
     scale = _first_scale(problem, u)
     damping = np.concatenate(([0.0], np.geomspace(1e-2, 1e4, 7)))
     shrink = np.array([2.0, 1.0, 0.5, 0.25, 0.1, 0.03])
-    for _ in range(iterations):
+    for iteration in range(iterations):
         gradient, hessian = _derivatives(problem, u, scale, value)
         w, q = np.linalg.eigh(-hessian)
         steps = []
@@ -197,7 +197,7 @@ def _climb(problem: Problem, u: Array, iterations: int = 60) -> Mode | None:
         scale = _bounded(scale)
         if gain < 1e-3 and np.all(np.abs(w - 1.0) < 0.5):
             break
-        if gain <= 0 and _ > 20:
+        if gain <= 0 and iteration > 20:
             break
     _, hessian = _derivatives(problem, u, scale, value)
     w, q = np.linalg.eigh(-hessian)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from fitting.diagnostics import RHAT_LIMIT, autocorrelation_time, split_rhat
 from fitting.optimum import Mode
-from gonio.errors import ConvergenceError
+from gonio.errors import ConvergenceError, ParameterError
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -63,6 +63,11 @@ class Rule:
     first: int = 200
     growth: float = 1.15
     max_steps: int = 10000
+
+    def __post_init__(self) -> None:
+        for name in ("ensembles", "first", "max_steps"):
+            if getattr(self, name) < 1:
+                raise ParameterError(f"{name} = {getattr(self, name)} leaves nothing to sample; choose 1 or more")
 
 
 @dataclass(frozen=True)

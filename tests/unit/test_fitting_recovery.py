@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from fitting import Rule, fit
-from gonio.errors import ConvergenceError
+from gonio.errors import ConvergenceError, ParameterError
 from gonio.samples import BRDFSamples, SharedError
 
 QUICK = Rule(ensembles=2, taus=15, drift=0.3, first=150)
@@ -216,6 +216,14 @@ def test_degenerate_data_give_a_defined_result(samples):
     assert np.all((values >= 0) & (values <= 1))
     assert posterior.brdf().f_r(0.3, 0.0, 0.3, math.pi) >= 0
     assert posterior.diagnostics["advice"]
+
+
+def test_a_seed_or_a_length_that_makes_no_sense_is_refused():
+    s = BRDFSamples.plain([0.3], [0.0], [0.5], [3.0], [0.2], [0.01])
+    with pytest.raises(ParameterError, match="seed = -1"):
+        fit(s, "lambertian", seed=-1)
+    with pytest.raises(ParameterError, match="max_steps = 0"):
+        fit(s, "lambertian", max_steps=0)
 
 
 def test_samples_that_no_parameter_explains_are_named():
