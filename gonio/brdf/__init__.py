@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from gonio.brdf.base import BRDF, Model, Parameter, Term, _suggest, term_names
+from gonio.brdf.function import from_function
 from gonio.brdf.lambertian import LAMBERTIAN
 from gonio.brdf.microfacet import GGX
+from gonio.brdf.oren_nayar import OREN_NAYAR
+from gonio.brdf.phong import PHONG
 from gonio.brdf.specular import SPECULAR
 from gonio.errors import ParameterError
 
-__all__ = ["BRDF", "Model", "Parameter", "Term", "make", "models", "parse", "term_names"]
+__all__ = ["BRDF", "Model", "Parameter", "Term", "from_function", "make", "models", "parse", "term_names"]
 
-_MODELS = {model.name: model for model in (LAMBERTIAN, GGX, SPECULAR)}
+_MODELS = {model.name: model for model in (LAMBERTIAN, OREN_NAYAR, PHONG, GGX, SPECULAR)}
+_VARIANTS = {("oren_nayar", "qualitative"): OREN_NAYAR}
 
 
 def models() -> dict[str, Model]:
@@ -18,13 +22,15 @@ def models() -> dict[str, Model]:
     return dict(_MODELS)
 
 
-def make(name: str, **parameters: float) -> BRDF:
+def make(name: str, *, variant: str | None = None, **parameters: float) -> BRDF:
     """A BRDF of one model.
 
     Parameters
     ----------
     name : str
         A key of `models`.
+    variant : str, optional
+        Of models that come in several: oren_nayar ("qualitative").
     **parameters : float
         All parameters of the model; angles in radians.
 
@@ -39,6 +45,14 @@ def make(name: str, **parameters: float) -> BRDF:
     lambertian(albedo=0.8) + ggx(k_s=1, alpha=0.3, f_0=0.04)
     """
     model = find(name)
+    if variant is not None:
+        if (name, variant) not in _VARIANTS:
+            known = sorted(v for n, v in _VARIANTS if n == name)
+            raise ParameterError(
+                f"{name} has no variant {variant!r}{_suggest(variant, known)}; "
+                + (f"it has: {', '.join(known)}" if known else "leave it out")
+            )
+        model = _VARIANTS[name, variant]
     return BRDF([Term(model, model.values(parameters))])
 
 

@@ -73,13 +73,21 @@ class Model:
     parameters : tuple of Parameter
         In the order of the parameter array.
     function : callable
-        ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function.
+        ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function and for
+        a function that is not compiled.
     lobe_width : callable, optional
         Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
         angle; the integrator lays its nodes by it. None: no lobe.
+    kinks : callable, optional
+        ``(p, omega_r (3,)) -> (k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which f_r or a
+        derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels there.
+    array_function : callable, optional
+        ``(omega_i (n, 3), omega_r (n, 3), p) -> (n,)`` for code that is not compiled; `function` is then None.
     diffuse : bool
         f_r is the same for all pairs of directions (Lambert).
     isotropic, reciprocal, energy_bounded : bool
+    own : bool
+        A user's function: errors of its integrals are estimates.
     """
 
     name: str
@@ -88,10 +96,18 @@ class Model:
     doc: str
     reference: str
     lobe_width: Callable[[Array], float] | None = None
+    kinks: Callable[[Array, Array], Array] | None = None
+    array_function: Callable[[Array, Array, Array], Array] | None = None
     diffuse: bool = False
     isotropic: bool = True
     reciprocal: bool = True
     energy_bounded: bool = True
+    own: bool = False
+
+    @property
+    def delta(self) -> bool:
+        """Whether the model is a delta function, without a value at a pair of directions."""
+        return self.function is None and self.array_function is None
 
     def values(self, given: Mapping[str, float]) -> Array:
         """Parameter array from named values; every parameter must be given, and no other."""
@@ -118,6 +134,10 @@ class Term:
     def lobe_width(self) -> float | None:
         """Half width of the term's lobe [rad], None without one."""
         return None if self.model.lobe_width is None else float(self.model.lobe_width(self.values))
+
+    def kinks(self, omega_r: Array) -> Array:
+        """Planes ``c . w = d`` of the term's kinks for a reflected direction (3,), shape (k, 4); k = 0 without any."""
+        return np.empty((0, 4)) if self.model.kinks is None else self.model.kinks(self.values, omega_r)
 
 
 class BRDF:
@@ -219,7 +239,9 @@ class BRDF:
 
 
 def accumulate(model: Model) -> Any:
-    """Compiled ``kernel(omega_i (n, 3), omega_r (n, 3), p, weight, out (n,))`` that adds weight * f_r to `out`."""
+    """``kernel(omega_i (n, 3), omega_r (n, 3), p, weight, out (n,))`` that adds weight * f_r; compiled if it can be."""
+    if model.array_function is not None:
+        return functools.partial(_accumulate_array, model.array_function)
     if model.function is None:
         raise ParameterError(
             f"{model.name} is a delta function and has no value at a pair of directions; use it in a reflectance map"
@@ -236,6 +258,12 @@ def _accumulate(function: Callable[..., float]) -> Any:
             )
 
     return jit.kernel(accumulate_terms)
+
+
+def _accumulate_array(
+    function: Callable[[Array, Array, Array], Array], omega_i: Array, omega_r: Array, p: Array, weight: float, out: Array
+) -> None:
+    out += weight * function(omega_i, omega_r, p)
 
 
 def term_names(models: Iterable[Model]) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ def plan(brdf: BRDF, source: Source) -> list[Step]:
 
 def _step(term: Term, part: Cap | Collimated) -> Step:
     amount = part.irradiance if isinstance(part, Collimated) else part.radiance
-    mirror = term.model.function is None
+    mirror = term.model.delta
     if amount == 0.0 or term.weight == 0.0:
         return Step(term, part, Method.ZERO, "zero radiance" if amount == 0.0 else "zero weight")
     if isinstance(part, Collimated):
