@@ -1,7 +1,8 @@
 r"""Light sources: distant, in viewer-oriented coordinates (z towards the viewer).
 
-A source is a sum of parts. A part is either a collimated beam, a delta function in direction, or a radiance over a cap of
-directions around an axis: a disk, a hemisphere, the whole sphere. That one shape is all the integrator has to know.
+A source is a sum of parts. A part is a collimated beam (a delta function in direction), a radiance over a cap of directions
+around an axis (a disk, a hemisphere, the whole sphere), or any other radiance field (`gonio.fields`). That is all the
+integrator has to know. A point source at a finite distance is no part of a source: it becomes a beam where it falls.
 
 References
 ----------
@@ -14,6 +15,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gonio.errors import GeometryError, ParameterError
+from gonio.fields import EnvironmentMap, Field, FunctionField, Harmonics, Lobes
 from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
@@ -75,8 +78,11 @@ class Cap:
         return np.where(along > math.cos(self.half_angle), self.radiance * relative, 0.0)
 
 
+Part = Collimated | Cap | Field
+
+
 class Source:
-    """A sum of collimated beams and caps.
+    """A sum of collimated beams, caps and fields. Functions of unit vectors, (n, 3) -> (n,), may be added as they are.
 
     Examples
     --------
@@ -85,18 +91,39 @@ class Source:
     2.0
     """
 
-    def __init__(self, parts: Iterable[Collimated | Cap]) -> None:
+    def __init__(self, parts: Iterable[Part]) -> None:
         self.parts = tuple(parts)
         if not self.parts:
             raise ParameterError("a source needs at least one part")
 
-    def __add__(self, other: Source) -> Source:
-        if not isinstance(other, Source):
+    @classmethod
+    def of(cls, source: Source | Callable[[Array], ArrayLike]) -> Source:
+        """The source itself, or a source made of a function.
+
+        Raises
+        ------
+        ParameterError
+            If it is neither.
+        """
+        return source if isinstance(source, Source) else function(source)
+
+    @classmethod
+    def from_callable(cls, radiance: Callable[[Array], ArrayLike], detail: float = 0.1) -> Source:
+        """A source from a function of unit vectors; see `function`."""
+        return function(radiance, detail)
+
+    def __add__(self, other: Source | Callable[[Array], ArrayLike]) -> Source:
+        if not (isinstance(other, Source) or callable(other)):
             return NotImplemented
-        return Source(self.parts + other.parts)
+        return Source(self.parts + Source.of(other).parts)
+
+    def __radd__(self, other: Callable[[Array], ArrayLike]) -> Source:
+        if not callable(other):
+            return NotImplemented
+        return Source(Source.of(other).parts + self.parts)
 
     def __repr__(self) -> str:
-        return " + ".join(part.kind if isinstance(part, Cap) else "collimated" for part in self.parts)
+        return " + ".join("collimated" if isinstance(part, Collimated) else part.kind for part in self.parts)
 
     def radiance(self, direction: ArrayLike) -> Array:
         """Radiance arriving from directions; beams are delta functions and do not count.
@@ -114,7 +141,7 @@ class Source:
         w = np.asarray(direction, dtype=float)
         total = np.zeros(w.reshape(-1, 3).shape[0])
         for part in self.parts:
-            if isinstance(part, Cap):
+            if not isinstance(part, Collimated):
                 total += part.at(w.reshape(-1, 3))
         return total.reshape(w.shape[:-1])
 
@@ -174,7 +201,102 @@ def _overcast(along: Array) -> Array:
     return (1.0 + 2.0 * along) / 3.0
 
 
-_KINDS: dict[str, Callable[..., Source]] = {f.__name__: f for f in (collimated, uniform, hemispherical, disk, overcast)}
+def lobes(amplitude: ArrayLike, kappa: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Source:
+    """Von Mises-Fisher lobes: sum of amplitude exp(kappa (mu.w - 1)).
+
+    Parameters
+    ----------
+    amplitude, kappa, theta, phi : array_like, scalars or shape (k,)
+        Peak radiance [W m^-2 sr^-1], concentration [1] in [0, 1e5], direction mu of the peak [rad].
+    """
+    return Source([Lobes.checked(amplitude, kappa, theta, phi)])
+
+
+def environment_map(
+    radiance: ArrayLike | str | os.PathLike[str], interpolation: str = "bilinear", channel: str = "luminance"
+) -> Source:
+    """Radiance sampled on a grid of directions; see `gonio.fields.EnvironmentMap`.
+
+    Parameters
+    ----------
+    radiance : array_like, shape (n_theta, n_phi), or path
+        At theta = (i + 1/2) pi / n_theta, phi = (j + 1/2) 2 pi / n_phi [W m^-2 sr^-1]; or an HDR, floating-point TIFF or NPY
+        file of it.
+    interpolation : {"bilinear", "smooth"}
+        Smooth is a cubic spline, and faster to integrate to high accuracy.
+    channel : {"luminance", "red", "green", "blue"}
+        Of a colour image.
+    """
+    if isinstance(radiance, str | os.PathLike):
+        from gonio.environment import read
+
+        radiance = read(radiance, channel)
+    return Source([EnvironmentMap.checked(radiance, interpolation)])
+
+
+def spherical_harmonics(coefficients: ArrayLike) -> Source:
+    """Real spherical harmonics, (l + 1)^2 coefficients in the order l^2 + l + m; see `gonio.fields.Harmonics`."""
+    return Source([Harmonics.checked(coefficients)])
+
+
+def function(radiance: Callable[[Array], ArrayLike], detail: float = 0.1) -> Source:
+    """Any function of unit vectors, (n, 3) -> (n,) [W m^-2 sr^-1].
+
+    Parameters
+    ----------
+    radiance : callable
+        Must give finite values >= 0 for all directions of the sphere.
+    detail : float
+        Smallest angle over which it changes [rad]; a narrower lobe could be missed, and nothing could tell.
+    """
+    return Source([FunctionField.checked(radiance, detail)])
+
+
+@dataclass(frozen=True)
+class PointSource:
+    """A small lamp at a finite distance (memo, section 3: the irradiance falls with the square of the distance).
+
+    Attributes
+    ----------
+    position : tuple of float, length 3
+        [m], viewer-oriented.
+    intensity : float
+        Radiant intensity, the same in all directions [W/sr].
+    """
+
+    position: tuple[float, float, float]
+    intensity: float
+
+    def beam_at(self, surface: Sequence[float]) -> Source:
+        """The beam that a surface element at `surface` [m] receives: a collimated source of irradiance I / r^2."""
+        ray = np.asarray(self.position) - np.asarray(surface, dtype=float)
+        squared = float(ray @ ray) if ray.shape == (3,) else math.nan
+        if not (math.isfinite(squared) and squared > 0):
+            raise GeometryError(f"point: no distance between lamp {self.position} and surface {list(surface)} m")
+        x, y, z = ray / math.sqrt(squared)
+        return Source([Collimated((float(x), float(y), float(z)), self.intensity / squared)])
+
+    def irradiance(self, surface: Sequence[float], normal: Sequence[float]) -> float:
+        """E_i = I max(0, cos theta_i) / r^2 on a surface element with that normal [W m^-2]."""
+        beam = self.beam_at(surface).parts[0]
+        assert isinstance(beam, Collimated)
+        return beam.irradiance * max(0.0, float(np.dot(beam.direction, _axis(normal))))
+
+
+def point(position: Sequence[float], intensity: float) -> PointSource:
+    """A lamp at a finite distance: position [m] in viewer-oriented coordinates, radiant intensity [W/sr]."""
+    where = np.asarray(position, dtype=float)
+    if where.shape != (3,) or not np.all(np.isfinite(where)):
+        raise GeometryError(f"point: position = {list(position)} is no place; give three finite numbers in metres")
+    return PointSource((float(where[0]), float(where[1]), float(where[2])), _amount("intensity", intensity))
+
+
+_KINDS: dict[str, Callable[..., Source]] = {
+    f.__name__: f
+    for f in (
+        collimated, uniform, hemispherical, disk, overcast, lobes, environment_map, spherical_harmonics, function,
+    )
+}  # fmt: skip
 
 
 def kinds() -> dict[str, Callable[..., Source]]:

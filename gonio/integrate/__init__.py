@@ -21,12 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from gonio.brdf.base import BRDF
 from gonio.errors import GeometryError, IntegrationError, ParameterError
+from gonio.fields import Field
 from gonio.geometry import normal_from_gradient
 from gonio.integrate import closed_forms, radial
+from gonio.integrate.field_quadrature import integrate_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.plan import Method, Step, plan
 from gonio.integrate.quadrature import integrate_cap
-from gonio.source import Cap, Collimated, Source, uniform
+from gonio.source import Collimated, Source, uniform
 
 __all__ = ["Estimate", "MapValues", "directional_albedo", "plan", "reflectance_map", "scene_radiance"]
 
@@ -103,7 +105,7 @@ def reflectance_map(
     theta_n = normal_from_gradient(p.ravel(), q.ravel())[0]
     value, error = np.zeros(len(elements)), np.zeros(len(elements))
     impulses: list[tuple[float, float, float]] = []
-    steps = plan(brdf, source)
+    steps = plan(brdf, Source.of(source))
     share = 1.0 / max(1, len(steps))
     for step in steps:
         start = time.perf_counter()
@@ -136,10 +138,12 @@ def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: floa
     if isinstance(part, Collimated):
         step.effort.add(len(elements), 1)
         return closed_forms.collimated(term, part, elements)
-    if step.method is Method.LAMBERT:
-        return closed_forms.lambertian_cap(term, part, elements)
     if step.method is Method.MIRROR:
         return closed_forms.mirror_cap(term, part, elements)
+    if isinstance(part, Field):
+        return integrate_field(term, part, elements, rtol=rtol, atol=atol, effort=step.effort)
+    if step.method is Method.LAMBERT:
+        return closed_forms.lambertian_cap(term, part, elements)
     if step.method is Method.RADIAL:
         slopes, where = np.unique(theta_n, return_inverse=True)
         if len(slopes) > _FEW:
@@ -199,8 +203,12 @@ def scene_radiance(
     elements = Elements.from_polar(theta.ravel(), phi.ravel())
     value, error = np.zeros(len(elements)), np.zeros(len(elements))
     for step in plan(brdf, source):
-        if not isinstance(step.part, Cap):
+        if isinstance(step.part, Collimated):
             raise ParameterError("a collimated beam is a delta function: its integral is closed form 14a, not a quadrature")
+        if isinstance(step.part, Field):
+            v, e = integrate_field(step.term, step.part, elements, rtol=rtol, atol=0.0, effort=step.effort)
+            value, error = value + v, error + e
+            continue
         v, e = integrate_cap(
             step.term, step.part, elements, rtol=rtol, atol=0.0, about_normal=form == "local", effort=step.effort
         )

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.brdf.base import Term, accumulate
+from gonio.fields import Field
 from gonio.integrate.frames import Elements
 from gonio.source import Cap, Collimated
 
@@ -58,7 +59,7 @@ def is_lambertian_cap(term: Term, cap: Cap) -> bool:
     return term.model.diffuse and cap.profile is None and (cap.half_angle >= np.pi or cap.half_angle == np.pi / 2)
 
 
-def mirror_cap(term: Term, cap: Cap, elements: Elements) -> tuple[Array, Array]:
+def mirror_cap(term: Term, cap: Cap | Field, elements: Elements) -> tuple[Array, Array]:
     """15b, 15c: a mirror under a cap. On the rim itself the value is undefined; 0 is returned there."""
     value = term.weight * term.values[0] * cap.at(elements.mirror())
     return value, 8.0 * EPS * np.abs(value)

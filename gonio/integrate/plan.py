@@ -6,9 +6,10 @@ import enum
 from dataclasses import dataclass, field
 
 from gonio.brdf.base import BRDF, Term
+from gonio.fields import Field
 from gonio.integrate import closed_forms
 from gonio.integrate.quadrature import Effort
-from gonio.source import Cap, Collimated, Source
+from gonio.source import Collimated, Part, Source
 
 
 class Method(enum.Enum):
@@ -21,6 +22,7 @@ class Method(enum.Enum):
     IMPULSE = "closed form 15a"
     RADIAL = "one-dimensional in theta_n"
     GENERAL = "quadrature per gradient"
+    FIELD = "quadrature of a field per gradient"
 
 
 @dataclass
@@ -36,7 +38,7 @@ class Step:
     """
 
     term: Term
-    part: Cap | Collimated
+    part: Part
     method: Method
     reason: str
     effort: Effort = field(default_factory=Effort)
@@ -45,7 +47,7 @@ class Step:
 
     def describe(self) -> dict[str, object]:
         """Row of ``--explain``."""
-        kind = self.part.kind if isinstance(self.part, Cap) else "collimated"
+        kind = "collimated" if isinstance(self.part, Collimated) else self.part.kind
         return {
             "term": self.term.model.name,
             "source": kind,
@@ -63,7 +65,7 @@ def plan(brdf: BRDF, source: Source) -> list[Step]:
     return [_step(term, part) for term in brdf.terms for part in source.parts]
 
 
-def _step(term: Term, part: Cap | Collimated) -> Step:
+def _step(term: Term, part: Part) -> Step:
     amount = part.irradiance if isinstance(part, Collimated) else part.radiance
     mirror = term.model.delta
     if amount == 0.0 or term.weight == 0.0:
@@ -74,6 +76,8 @@ def _step(term: Term, part: Cap | Collimated) -> Step:
         return Step(term, part, Method.BEAM, "a beam: one evaluation per gradient; back-facing gradients are 0")
     if mirror:
         return Step(term, part, Method.MIRROR, "a mirror: the source seen in the mirror direction")
+    if isinstance(part, Field):
+        return Step(term, part, Method.FIELD, "a radiance field: panels between its features, the lobe and the horizon")
     if closed_forms.is_lambertian_cap(term, part):
         return Step(term, part, Method.LAMBERT, "a diffuse surface under a uniform sphere or hemisphere")
     if term.model.isotropic and part.axis in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
