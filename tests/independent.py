@@ -1,0 +1,456 @@
+r"""A second opinion on reflected radiance: its own formulas, its own geometry, its own adaptive quadrature, no gonio code.
+
+.. math:: R = \int f_r\,L_i\,\max(0, \cos\theta_i)\,\mathrm{d}\omega_i
+
+Everything that makes the integrand jump or bend (horizon of the surface, horizon of a sky, rim of a disk, edges of texels,
+kinks of a model) is a circle on the sphere. In polar coordinates (t, chi) about any pole, a circle of angular radius delta
+whose centre is gamma from the pole cuts the ring t at
+
+.. math:: \tan^2\frac{\chi}{2} = \frac{\sin\frac{\delta+t-\gamma}{2}\,\sin\frac{\delta-t+\gamma}{2}}
+                                      {\sin\frac{t+\gamma+\delta}{2}\,\sin\frac{t+\gamma-\delta}{2}} ,
+
+so each ring is split where circles cut it, and the rings where two circles meet or one touches. Between, the integrand is
+smooth, and panels are halved until the rule is content. Two methods share nothing but this arrangement:
+
+- ``"normal"``: pole at the surface normal, models written in angles, Gauss-Kronrod (21 points);
+- ``"other"``: pole at the source's axis or at the mirror direction, models written in vectors, Gauss-Legendre (12 points)
+  on a panel against its halves.
+
+A scene is plain data, as in tests/data/problems.json: ``{"brdf": [{"model": "ggx", ...}], "source": [{"kind": "disk",
+...}], "p": 0.1, "q": 0.2}``, angles in radians. It is slow and knows only what the tests need.
+
+References
+----------
+.. [1] R. Piessens et al., QUADPACK, Springer, 1983 (nodes and error of the 21-point Gauss-Kronrod rule).
+.. [2] B. Walter et al., EGSR 2007; E. Heitz, JCGT 3(2), 2014; C. Schlick, CGF 13(3), 1994 (GGX).
+.. [3] M. Oren, S. K. Nayar, SIGGRAPH 1994 (qualitative model). E. P. Lafortune, Y. D. Willems, 1994 (Phong).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+EPS = float(np.finfo(float).eps)
+HALF_PI = 0.5 * math.pi
+_POINTS = 400_000  # integrand values held at once
+
+
+# --- rules: nodes on [0, 1], weights of the result and of its rival ---------------------------------------------------
+
+_KRONROD = (
+    (0.995657163025808080735527280689003, 0.011694638867371874278064396062192, 0.0),
+    (0.973906528517171720077964012084452, 0.032558162307964727478818972459390, 0.066671344308688137593568809893332),
+    (0.930157491355708226001207180059508, 0.054755896574351996031381300244580, 0.0),
+    (0.865063366688984510732096688423493, 0.075039674810919952767043140916190, 0.149451349150580593145863396957658),
+    (0.780817726586416897063717578345042, 0.093125454583697605535065465083366, 0.0),
+    (0.679409568299024406234327365114874, 0.109387158802297641899210590325805, 0.219086362515982043995534934228163),
+    (0.562757134668604683339000099272694, 0.123491976262065851077958109585166, 0.0),
+    (0.433395394129247190799265943165784, 0.134709217311473325928054001771707, 0.269266719309996355091226921569469),
+    (0.294392862701460198131126603103866, 0.142775938577060080797094273138717, 0.0),
+    (0.148874338981631210884826001129720, 0.147739104901338491374841515972068, 0.295524224714752870173815619188769),
+    (0.0, 0.149445554002916905664936468389821, 0.0),
+)  # fmt: skip
+
+
+def _kronrod() -> tuple[Array, Array, Array]:
+    x, k, g = np.array(_KRONROD).T
+    return (
+        np.concatenate((-x, x[-2::-1])) / 2 + 0.5,
+        np.concatenate((k, k[-2::-1])) / 2,
+        np.concatenate((g, g[-2::-1])) / 2,
+    )
+
+
+def _halves() -> tuple[Array, Array, Array]:
+    x, w = np.polynomial.legendre.leggauss(12)
+    x, w = (x + 1) / 2, w / 2
+    nothing = np.zeros(12)
+    return (
+        np.concatenate((x, x / 2, (x + 1) / 2)),
+        np.concatenate((nothing, w / 2, w / 2)),
+        np.concatenate((w, nothing, nothing)),
+    )
+
+
+RULES = {"normal": _kronrod(), "other": _halves()}
+
+
+def _judge(values: Array, width: Array, rule: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Integral over each panel and its error as QUADPACK judges it; values (panels, nodes), width (panels,)."""
+    _, weights, rival = rule
+    result = values @ weights
+    spread = np.abs(values - result[:, None]) @ weights * width
+    off = np.abs(result - values @ rival) * width
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.where(spread > 0, spread * np.minimum(1.0, (200.0 * off / spread) ** 1.5), off)
+    return result * width, error
+
+
+# --- the surface, and models in two notations -------------------------------------------------------------------------
+
+
+class Surface:
+    """A surface element of gradient (p, q) seen from z: normal, mirror direction, cosines, all in viewer's coordinates."""
+
+    def __init__(self, p: float, q: float) -> None:
+        slope = math.hypot(p, q)
+        self.flat = slope == 0.0
+        length = math.hypot(slope, 1.0)
+        self.cos_r, self.sin_r = 1.0 / length, slope / length
+        self.theta_r = math.atan2(slope, 1.0)
+        c, s = (1.0, 0.0) if self.flat else (-p / slope, -q / slope)
+        self.normal = np.array([self.sin_r * c, self.sin_r * s, self.cos_r])
+        self.tangent = np.array([self.cos_r * c, self.cos_r * s, -self.sin_r])  # mirror = cos_r normal + sin_r tangent
+        self.binormal = np.array([-s, c, 0.0])
+        self.mirror = self.cos_r * self.normal + self.sin_r * self.tangent
+
+
+def _by_angles(term: dict[str, Any], surface: Surface, theta_i: Array, u: Array) -> Array:
+    """f_r for incident polar angle theta_i and azimuth u counted from the mirror direction."""
+    model = term["model"]
+    si, ci, sr, cr = np.sin(theta_i), np.cos(theta_i), surface.sin_r, surface.cos_r
+    if model == "lambertian":
+        return np.full(np.broadcast(theta_i, u).shape, term["albedo"] / math.pi)
+    if model == "phong":
+        n = term["n"]
+        return term["k_s"] * (n + 2) / (2 * math.pi) * np.maximum(0.0, ci * cr + si * sr * np.cos(u)) ** n
+    if model == "oren_nayar":
+        s2 = term["sigma"] ** 2
+        larger, smaller = np.maximum(theta_i, surface.theta_r), np.minimum(theta_i, surface.theta_r)
+        b = 0.45 * s2 / (s2 + 0.09) * np.maximum(0.0, -np.cos(u)) * np.sin(larger) * np.tan(smaller)
+        return term["albedo"] / math.pi * (1 - 0.5 * s2 / (s2 + 0.33) + b)
+    assert model == "ggx"
+    a = term["alpha"]
+    # cos 2 theta_d = cos of the angle between the two directions; tan theta_h from the sum's components
+    across = 4 * np.cos((theta_i + surface.theta_r) / 2) ** 2 * np.sin((theta_i - surface.theta_r) / 2) ** 2
+    across = across + 4 * si * sr * np.sin(u / 2) ** 2
+    tan2_h = across / (ci + cr) ** 2
+    cos2_h = 1 / (1 + tan2_h)
+    d = 1 / (math.pi * a**2 * cos2_h**2 * (1 + tan2_h / a**2) ** 2)
+    cos_d = np.minimum(1.0, np.sqrt(np.maximum(0.0, (across + (ci + cr) ** 2) / 4)))
+    fresnel = term["f_0"] + (1 - term["f_0"]) * (1 - cos_d) ** 5
+    # G / (cos cos) with Lambda = (sqrt(1 + a^2 tan^2) - 1) / 2
+    smith = 2 / (cr * np.hypot(ci, a * si) + ci * math.hypot(cr, a * sr))
+    return term["k_s"] * fresnel * d * smith / 4
+
+
+def _by_vectors(term: dict[str, Any], surface: Surface, w: Array) -> Array:
+    """f_r for unit vectors w (n, 3), viewer's coordinates; the viewer is (0, 0, 1)."""
+    model = term["model"]
+    mu_i, mu_r = w @ surface.normal, surface.cos_r
+    if model == "lambertian":
+        return np.full(len(w), term["albedo"] / math.pi)
+    if model == "phong":
+        n = term["n"]
+        aligned = np.maximum(0.0, w @ surface.mirror)
+        return term["k_s"] * (n + 2) / (2 * math.pi) * np.exp(n * np.log(np.maximum(aligned, 1e-300)))
+    if model == "oren_nayar":
+        s2 = term["sigma"] ** 2
+        bent = np.maximum(0.0, w[:, 2] - mu_i * mu_r) / np.maximum(mu_i, mu_r)  # sin sin cos(dphi) / cos of the smaller
+        return term["albedo"] / math.pi * (1 - 0.5 * s2 / (s2 + 0.33) + 0.45 * s2 / (s2 + 0.09) * bent)
+    assert model == "ggx"
+    a2 = term["alpha"] ** 2
+    total = w + np.array([0.0, 0.0, 1.0])
+    h = total / np.linalg.norm(total, axis=1)[:, None]
+    nh = h @ surface.normal
+    t, b = h @ surface.tangent, h @ surface.binormal
+    d = a2 / (math.pi * (a2 * nh**2 + t**2 + b**2) ** 2)
+    fresnel = term["f_0"] + (1 - term["f_0"]) * (1 - np.minimum(1.0, h[:, 2])) ** 5
+    t, b = w @ surface.tangent, w @ surface.binormal
+    root_i, root_r = np.sqrt(mu_i**2 + a2 * (t**2 + b**2)), math.sqrt(mu_r**2 + a2 * surface.sin_r**2)
+    return term["k_s"] * fresnel * d / (2 * (mu_r * root_i + mu_i * root_r))
+
+
+# --- sources ----------------------------------------------------------------------------------------------------------
+
+
+def _towards(theta: float, phi: float) -> Array:
+    return np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
+
+
+def _axis(part: dict[str, Any]) -> Array:
+    if "theta" in part:
+        return _towards(part["theta"], part["phi"])
+    axis = np.array(part.get("axis", (0.0, 0.0, 1.0)), dtype=float)
+    return axis / np.linalg.norm(axis)
+
+
+def _radiance(part: dict[str, Any], w: Array) -> Array:
+    """Radiance from unit vectors w (n, 3), taken as inside the source's clip."""
+    kind = part["kind"]
+    if kind in ("uniform", "hemispherical", "disk"):
+        return np.full(len(w), float(part["radiance"]))
+    if kind == "overcast":
+        return part["zenith_radiance"] * (1 + 2 * (w @ _axis(part))) / 3
+    if kind == "lobes":
+        off = w - _axis(part)  # mu.w - 1 = -|w - mu|^2 / 2
+        return part["amplitude"] * np.exp(-0.5 * part["kappa"] * np.sum(off**2, axis=1))
+    assert kind == "environment_map"
+    table = np.array(part["radiance"], dtype=float)
+    rows, columns = table.shape
+    theta = np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2])
+    x = np.clip(theta * rows / math.pi - 0.5, 0, rows - 1)
+    y = np.mod(np.arctan2(w[:, 1], w[:, 0]), 2 * math.pi) * columns / (2 * math.pi) - 0.5
+    i, j = np.minimum(x.astype(int), rows - 2), np.floor(y).astype(int)
+    x, y = x - i, y - j
+    left, right = j % columns, (j + 1) % columns
+    above = (1 - y) * table[i, left] + y * table[i, right]
+    return (1 - x) * above + x * ((1 - y) * table[i + 1, left] + y * table[i + 1, right])
+
+
+# --- circles, rings and the nested integral ---------------------------------------------------------------------------
+
+
+@dataclass
+class _Arrangement:
+    """Circles (centre, angular radius, whether only its inside counts) and narrow features (direction, width)."""
+
+    circles: list[tuple[Array, float, bool]] = field(default_factory=list)
+    features: list[tuple[Array, float]] = field(default_factory=list)
+
+    def inside(self, w: Array) -> NDArray[np.bool_]:
+        kept = np.ones(len(w), dtype=bool)
+        for centre, radius, clips in self.circles:
+            if clips:  # chord against chord: exact for tiny circles too
+                kept &= np.sum((w - centre) ** 2, axis=1) < 4 * math.sin(radius / 2) ** 2
+        return kept
+
+    def meetings(self) -> list[Array]:
+        """Points where two circles meet."""
+        points = []
+        for k, (c1, r1, _) in enumerate(self.circles):
+            for c2, r2, _ in self.circles[:k]:
+                cross = np.cross(c1, c2)
+                s2, dot = float(cross @ cross), float(c1 @ c2)
+                if s2 < 1e-20:
+                    continue
+                a, b = (math.cos(r1) - dot * math.cos(r2)) / s2, (math.cos(r2) - dot * math.cos(r1)) / s2
+                g2 = (1 - a * a - b * b - 2 * a * b * dot) / s2
+                if g2 >= 0:
+                    points += [a * c1 + b * c2 + s * math.sqrt(g2) * cross for s in (-1, 1)]
+        return points
+
+
+def _angle(a: Array, b: Array) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+def _steps(width: float) -> list[float]:
+    steps, step = [0.0], width
+    while step < 3.0:
+        steps += [step, -step]
+        step *= 5.0
+    return steps
+
+
+class _Rings:
+    """Polar coordinates about a pole e3 with azimuth 0 at e1, and the integral of a function over the arrangement."""
+
+    def __init__(self, e1: Array, e3: Array, arrangement: _Arrangement, rule: tuple[Array, Array, Array]) -> None:
+        e1 = e1 - (e1 @ e3) * e3
+        self.e1, self.e3 = e1 / np.linalg.norm(e1), e3
+        self.e2 = np.cross(self.e3, self.e1)
+        self.arrangement, self.rule = arrangement, rule
+
+    def _polar(self, w: Array) -> tuple[float, float]:
+        return _angle(self.e3, w), math.atan2(float(w @ self.e2), float(w @ self.e1))
+
+    def directions(self, t: Array, chi: Array) -> Array:
+        s = np.sin(t)
+        return (
+            (s * np.cos(chi))[:, None] * self.e1 + (s * np.sin(chi))[:, None] * self.e2 + np.cos(t)[:, None] * self.e3
+        )
+
+    def breaks(self) -> Array:
+        """Rings where the integrand of t is not smooth, from 0 to pi."""
+        at = [0.0, math.pi]
+        for centre, radius, _ in self.arrangement.circles:
+            gamma = _angle(self.e3, centre)
+            at += [abs(gamma - radius), gamma + radius, 2 * math.pi - gamma - radius]
+        at += [_angle(self.e3, w) for w in self.arrangement.meetings()]
+        for direction, width in self.arrangement.features:
+            t = self._polar(direction)[0]
+            at += [t + step for step in _steps(width)]
+        at = sorted(t for t in at if 0.0 <= t <= math.pi)
+        return np.array([t for k, t in enumerate(at) if k == 0 or t - at[k - 1] > 1e-14])
+
+    def panels(self, t: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Smooth and lit pieces of the rings t (n,): lower and upper azimuth and the ring's number."""
+        cuts = [np.zeros_like(t), np.full_like(t, math.pi), np.full_like(t, 2 * math.pi)]
+        for centre, radius, _ in self.arrangement.circles:
+            gamma, chi = self._polar(centre)
+            within = np.sin((radius + t - gamma) / 2) * np.sin((radius - t + gamma) / 2)
+            beyond = np.sin((t + gamma + radius) / 2) * np.sin((t + gamma - radius) / 2)
+            crossed = (within > 0) & (beyond > 0)
+            reach = 2 * np.arctan2(np.sqrt(np.where(crossed, within, 0)), np.sqrt(np.where(crossed, beyond, 1)))
+            cuts += [np.where(crossed, np.mod(chi + s * reach, 2 * math.pi), 0.0) for s in (-1, 1)]
+        for direction, width in self.arrangement.features:
+            t_f, chi = self._polar(direction)
+            if min(t_f, math.pi - t_f) < 1e-9:
+                continue
+            scale = np.hypot(t - t_f, width) / np.maximum(np.sin(t), 1e-12)
+            step = np.ones_like(t)
+            cuts.append(np.full_like(t, chi % (2 * math.pi)))
+            while np.any(scale * step < 3.0):
+                cuts += [np.where(scale * step < 3.0, np.mod(chi + s * scale * step, 2 * math.pi), 0.0) for s in (-1, 1)]
+                step = step * 5.0
+        edges = np.sort(np.stack(cuts, axis=1), axis=1)
+        lower, upper = edges[:, :-1], edges[:, 1:]
+        ring = np.broadcast_to(np.arange(len(t))[:, None], lower.shape)
+        wide = upper - lower > 1e-15
+        lower, upper, ring = lower[wide], upper[wide], ring[wide]
+        lit = self.arrangement.inside(self.directions(t[ring], 0.5 * (lower + upper)))
+        return lower[lit], upper[lit], ring[lit]
+
+    def ring_integrals(self, f: Callable[[Array, Array, Array], Array], t: Array, rtol: float, floor: float) -> Array:
+        """Integral of f(t, chi, w) over the lit azimuths of each ring t (n,)."""
+        done = np.zeros_like(t)
+        lower, upper, ring = self.panels(t)
+        x = self.rule[0]
+        for _ in range(60):
+            if not len(ring):
+                break
+            value, error = np.empty(len(ring)), np.empty(len(ring))
+            chunk = max(1, _POINTS // len(x))
+            for k in range(0, len(ring), chunk):
+                part = slice(k, k + chunk)
+                width = upper[part] - lower[part]
+                chi = (lower[part, None] + width[:, None] * x).ravel()
+                at = np.repeat(t[ring[part]], len(x))
+                values = f(at, chi, self.directions(at, chi)).reshape(-1, len(x))
+                value[part], error[part] = _judge(values, width, self.rule)
+            total = np.abs(done + np.bincount(ring, value, len(t)))
+            fine = (error <= np.maximum(rtol * total[ring], floor)) | (error <= 4 * EPS * np.abs(value))
+            done += np.bincount(ring[fine], value[fine], len(t))
+            lower, upper, ring = lower[~fine], upper[~fine], ring[~fine]
+            middle = 0.5 * (lower + upper)
+            lower, upper, ring = np.append(lower, middle), np.append(middle, upper), np.append(ring, ring)
+            if len(ring) > 4_000_000:
+                raise ArithmeticError("a ring does not converge")
+        return done
+
+    def integral(self, f: Callable[[Array, Array, Array], Array], rtol: float = 1e-13) -> float:
+        """Integral of f over the lit part of the sphere, d omega."""
+        edges = self.breaks()
+        a, b = edges[:-1], edges[1:]  # of the smooth interval that a panel belongs to
+        lower, upper = np.zeros_like(a), np.ones_like(a)  # in s, t = a + (b - a) s^2 (3 - 2 s): no square root at the ends
+        done, x = 0.0, self.rule[0]
+
+        def pieces(rtol: float, floor: float) -> tuple[Array, Array]:
+            width = upper - lower
+            s = lower[:, None] + width[:, None] * x
+            t = (a[:, None] + (b - a)[:, None] * s**2 * (3 - 2 * s)).ravel()
+            slope = ((b - a)[:, None] * 6 * s * (1 - s)).ravel() * np.sin(t)
+            rows = self.ring_integrals(f, t, rtol, floor)
+            return _judge((slope * rows).reshape(-1, len(x)), width, self.rule)
+
+        floor = 1e-5 * rtol * abs(float(pieces(1e-2, 1e-300)[0].sum()))  # rings far below the sum may be coarse
+        for _ in range(60):
+            if not len(a):
+                break
+            value, error = pieces(0.1 * rtol, floor)
+            total = abs(done + float(value.sum()))
+            floor = 0.01 * rtol * total
+            fine = (error <= rtol * total) | (error <= 4 * EPS * np.abs(value))
+            done += float(value[fine].sum())
+            a, b, lower, upper = a[~fine], b[~fine], lower[~fine], upper[~fine]
+            middle = 0.5 * (lower + upper)
+            a, b = np.append(a, a), np.append(b, b)
+            lower, upper = np.append(lower, middle), np.append(middle, upper)
+        return done
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def _arrange(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> _Arrangement:
+    found = _Arrangement([(surface.normal, HALF_PI, True)])
+    if part["kind"] in ("hemispherical", "overcast"):
+        found.circles.append((_axis(part), HALF_PI, True))
+    elif part["kind"] == "disk":
+        found.circles.append((_axis(part), part["half_angle"], True))
+    elif part["kind"] == "lobes":
+        found.features.append((_axis(part), 1 / math.sqrt(max(1.0, part["kappa"]))))
+    elif part["kind"] == "environment_map":
+        rows, columns = np.shape(part["radiance"])
+        found.circles += [(_towards(0.0, 0.0), (i + 0.5) * math.pi / rows, False) for i in range(rows)]
+        middles = {round(((j + 0.5) * 2 / columns) % 1.0, 12) for j in range(columns)}  # opposite ones share a plane
+        found.circles += [(_towards(HALF_PI, m * math.pi + HALF_PI), HALF_PI, False) for m in sorted(middles)]
+    if term["model"] == "ggx":
+        found.features.append((surface.mirror, term["alpha"]))
+    elif term["model"] == "phong":
+        found.features.append((surface.mirror, 1 / math.sqrt(max(1.0, term["n"]))))
+        found.circles.append((surface.mirror, HALF_PI, False))
+    elif term["model"] == "oren_nayar" and not surface.flat:
+        found.circles += [(surface.normal, surface.theta_r, False), (surface.tangent, HALF_PI, False)]
+    return found
+
+
+def _pole(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> Array:
+    """A pole that is not the normal: what is narrowest, else the source's axis, else any direction."""
+    narrow = [(1 / math.sqrt(part["kappa"]), _axis(part))] if part["kind"] == "lobes" and part["kappa"] > 1 else []
+    if part["kind"] == "disk":
+        narrow.append((part["half_angle"], _axis(part)))
+    if term["model"] == "ggx":
+        narrow.append((2 * term["alpha"], surface.mirror))
+    if term["model"] == "phong":
+        narrow.append((2 / math.sqrt(max(1.0, term["n"])), surface.mirror))
+    narrow = [(w, d) for w, d in narrow if w < 0.5] + [(1.0, _axis(part)), (2.0, _towards(1.1, 0.4))]
+    for _, direction in sorted(narrow, key=lambda pair: pair[0]):
+        if _angle(direction, surface.normal) > 1e-3:
+            return direction
+    return narrow[-1][1]
+
+
+def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: str) -> float:
+    if part["kind"] == "collimated":
+        w = _axis(part)
+        mu_i = float(w @ surface.normal)
+        if mu_i <= 0 or term["model"] == "specular":  # a mirror shows a beam as a delta function of the gradient
+            return 0.0
+        if method == "other":
+            return part["irradiance"] * mu_i * float(_by_vectors(term, surface, w[None])[0])
+        across, along = float(w @ surface.binormal), float(w @ surface.tangent)
+        theta_i, u = np.array([math.atan2(math.hypot(across, along), mu_i)]), np.array([math.atan2(across, along)])
+        return part["irradiance"] * math.cos(theta_i[0]) * float(_by_angles(term, surface, theta_i, u)[0])
+    found = _arrange(term, part, surface)
+    if term["model"] == "specular":
+        direction = surface.mirror[None]
+        return term["rho"] * float(np.where(found.inside(direction), _radiance(part, direction), 0.0)[0])
+    if method == "normal":
+        rings = _Rings(surface.tangent, surface.normal, found, RULES["normal"])
+        return rings.integral(lambda t, u, w: _by_angles(term, surface, t, u) * np.cos(t) * _radiance(part, w))
+    pole = _pole(term, part, surface)
+    side = min((surface.mirror, surface.normal), key=lambda d: abs(float(d @ pole)))  # azimuth 0, away from the pole
+    if abs(float(side @ pole)) > 0.999:
+        side = np.roll(pole, 1) + np.array([0.1, 0.0, 0.0])
+    rings = _Rings(side, pole, found, RULES["other"])
+    return rings.integral(
+        lambda t, u, w: _by_vectors(term, surface, w) * np.maximum(0.0, w @ surface.normal) * _radiance(part, w)
+    )
+
+
+def _single(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Parts with arrays of lobes taken apart."""
+    found = []
+    for part in parts:
+        if part["kind"] == "lobes" and np.ndim(part["kappa"]):
+            keys = ("amplitude", "kappa", "theta", "phi")
+            for values in zip(*(part[k] for k in keys), strict=True):
+                found.append({"kind": "lobes", **dict(zip(keys, values, strict=True))})
+        else:
+            found.append(part)
+    return found
+
+
+def reflected_radiance(scene: dict[str, Any], method: str) -> float:
+    """Scene radiance without delta functions [W m^-2 sr^-1], by method "normal" or "other"."""
+    surface = Surface(scene["p"], scene["q"])
+    return math.fsum(_pair(t, s, surface, method) for t in scene["brdf"] for s in _single(scene["source"]))
