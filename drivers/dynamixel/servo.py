@@ -182,6 +182,9 @@ class Servo:
     def move_to(self, angle: float) -> None:
         """Start moving to `angle` [rad]; returns at once.
 
+        A goal at which the axis stands already is approached anew from its side: where friction stops it is different
+        each time, so that the encoder's rounding errors of two poses are independent.
+
         Raises
         ------
         LimitError
@@ -189,10 +192,11 @@ class Servo:
         """
         goal = self._joint.goal(angle)
         self._need_connection()
-        if goal == self._goal:  # under way, or there
+        again = goal == self._goal
+        if again and not (self._arrived and self._joint.approach != "any"):  # under way, or there
             return
         present = self._healthy(self._bus.block(self._id)).position
-        legs, self._one_sided = self._joint.legs(present, goal, engaged=self._engaged and self._arrived)
+        legs, self._one_sided = self._joint.legs(present, goal, engaged=self._engaged and self._arrived and not again)
         if not self._one_sided:
             logger.warning("axis %s: no room to approach %.2f deg from one side", self.name, self._joint.degrees(goal))
         if self._watchdog:

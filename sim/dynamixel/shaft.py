@@ -1,8 +1,8 @@
 """The mechanics behind the registers: a shaft that friction stops, and a link that it drives with play.
 
 The shaft follows its profile and comes to rest a little short of the goal, as a proportional loop with friction does.
-How short is a function of seed and goal, so a resumed scan meets the angles that it would have met. A goal that is
-nearer than the friction does not move the shaft. The link moves only when the shaft reaches a flank of the play between
+How short depends on the seed, the goal and the two goals before, as a shaft that comes along another way sticks elsewhere;
+so a resumed scan soon meets the angles that it would have met. A goal nearer than the friction does not move the shaft. The link moves only when the shaft reaches a flank of the play between
 them, so after a small reversal it has not moved at all.
 
 No ringing, no load, no elasticity, and no gravity: a shaft without torque stays.
@@ -49,6 +49,7 @@ class Shaft:
         self._half_play = 0.5 * backlash
         self._friction = friction
         self._seed = seed
+        self._goals: tuple[int, ...] = ()  # the latest three
         self._motion = motion.rest(0.0, position)
         self._link = position  # where the link was when the motion began
 
@@ -89,13 +90,14 @@ class Shaft:
         if math.isinf(speed) or not math.isinf(acceleration):
             acceleration = min(acceleration, ACCELERATION)
         stop = motion.stopping_point(position, velocity, acceleration)
-        short = self._short(goal)
+        self._goals = (*self._goals[-2:], goal)
+        short = self._short()
         target = stop if abs(goal - stop) <= short else goal - math.copysign(short, goal - stop)
         self._begin(t, motion.plan(t, position, velocity, target, min(speed, self._fastest), acceleration))
 
-    def _short(self, goal: int) -> float:
+    def _short(self) -> float:
         """Distance from the goal at which friction stops the shaft [counts]."""
-        key = f"{self._seed}:{goal % COUNTS_PER_TURN}".encode()
+        key = ":".join([self._seed, *(str(goal % COUNTS_PER_TURN) for goal in self._goals)]).encode()
         fraction = int.from_bytes(hashlib.blake2b(key, digest_size=8).digest(), "big") / 2.0**64
         low, high = self._friction
         return low + fraction * (high - low)

@@ -72,7 +72,7 @@ def test_all_problems_of_a_file_at_once() -> None:
         ("arm_deg = 30.0", "arm_deg = 5.0", "puts the light arm before the camera"),
         ("pan_deg = 15.0", "pan_deg = 85.0", "outside the axis' limits [-80, 80] degrees"),
         ("[0.002, 0.016, 0.128]", "[0.002, 0.128, 0.016]", "the shortest first"),
-        ("roi = [70, 50, 20, 20]", "roi = [150, 50, 20, 20]", "must lie within the image of 160 x 120"),
+        ("roi = [76, 56, 8, 8]", "roi = [150, 50, 20, 20]", "must lie within the image of 160 x 120"),
         ('kind = "sim"', 'kind = "none"', "does not go with"),
         ('port = "sim"                  # REAL: "/dev/ttyUSB1"', 'port = "/dev/ttyUSB1"', "all three are \"sim\", or none is"),
         ("direction = 1", "direction = 0", "turns nowhere"),

@@ -209,15 +209,17 @@ def test_a_longer_way_up_needs_one_leg_and_a_way_down_two(bench: Bench) -> None:
     assert rig.finish(servo) == [2378 - 23, 2378]
 
 
-def test_the_same_goal_again_sends_nothing(bench: Bench) -> None:
+def test_the_same_goal_again_is_approached_anew_unless_under_way(bench: Bench) -> None:
     rig = bench()
     servo = rig.connected()
     servo.move_to(30 * DEG)
-    rig.finish(servo)
     before = rig.writes(116)
     servo.move_to(30 * DEG)
-    assert servo.settled()
     assert rig.writes(116) == before
+    goals = rig.finish(servo)
+    servo.move_to(30 * DEG)
+    assert rig.finish(servo)[-1] == goals[-1]
+    assert rig.writes(116) == before + 2  # back, and to the goal from its side
 
 
 def test_overshoot_stays_inside_the_limits(bench: Bench) -> None:

@@ -60,7 +60,7 @@ def test_samples_come_from_measured_angles_and_the_drifting_white(run):
     assert samples.theta_r[:2] == pytest.approx(np.radians([15, 0]), abs=1e-12)
     assert calls[-1] == ("reduce", 3, 3)
     assert [s.name for s in samples.shared] == ["scale", "arm", "pan", "tilt", "drift"]
-    assert samples.shared[0].u == pytest.approx(rig.white.u_beta, rel=0.01)
+    assert samples.shared[0].u == pytest.approx(rig.white.u_beta, rel=0.03)  # and the noise of the white
     assert samples.shared[1].u == pytest.approx(np.radians(0.1))
     assert samples.attributes["rig"] == rig.name and samples.attributes["white_not_bracketed"] == "0"
 
