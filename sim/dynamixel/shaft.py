@@ -2,8 +2,8 @@
 
 The shaft follows its profile and comes to rest a little short of the goal, as a proportional loop with friction does.
 How short depends on the seed, the goal and the two goals before, as a shaft that comes along another way sticks elsewhere;
-so a resumed scan soon meets the angles that it would have met. A goal nearer than the friction does not move the shaft. The link moves only when the shaft reaches a flank of the play between
-them, so after a small reversal it has not moved at all.
+so a resumed scan soon meets the angles that it would have met. A goal nearer than the friction does not move the shaft.
+The link moves only when the shaft reaches a flank of the play between them, so after a small reversal it has not moved.
 
 No ringing, no load, no elasticity, and no gravity: a shaft without torque stays.
 """

@@ -87,12 +87,16 @@ def test_coverage_over_200_seeds() -> None:
         found = np.array(pool.map(held, seeds, chunksize=5))  # (seed, parameter, 3)
     inside95, inside68, pulls = found[:, :, 0], found[:, :, 1], found[:, :, 2]
     share = float(inside95.mean())
-    each = ", ".join(
-        f"{name} {inside95[:, k].mean():.3f} (68 %: {inside68[:, k].mean():.3f}, pulls {pulls[:, k].mean():+.2f} +- {pulls[:, k].std():.2f})"
+    each = [
+        f"{name} {inside95[:, k].mean():.3f} (68 %: {inside68[:, k].mean():.3f}, pulls {pulls[:, k].mean():+.2f} "
+        f"+- {pulls[:, k].std():.2f})"
         for k, name in enumerate(NAMES)
-    )
+    ]
     record(
-        "coverage of 95 % intervals, small scans on the virtual clock", f"{share:.3f}: {each}", "0.91 to 0.98", "1000 to 1199",
+        "coverage of 95 % intervals, 200 small scans on the virtual clock",
+        f"{share:.3f}: {', '.join(each)}",
+        "0.91 to 0.98",
+        "1000 to 1199",
         "pytest -m gate tests/closed_loop/test_coverage.py",
-    )  # fmt: skip
+    )
     assert 0.91 <= share <= 0.98

@@ -74,7 +74,7 @@ def test_all_problems_of_a_file_at_once() -> None:
         ("[0.002, 0.016, 0.128]", "[0.002, 0.128, 0.016]", "the shortest first"),
         ("roi = [76, 56, 8, 8]", "roi = [150, 50, 20, 20]", "must lie within the image of 160 x 120"),
         ('kind = "sim"', 'kind = "none"', "does not go with"),
-        ('port = "sim"                  # REAL: "/dev/ttyUSB1"', 'port = "/dev/ttyUSB1"', "all three are \"sim\", or none is"),
+        ('port = "sim"                  # REAL: "/dev/ttyUSB1"', 'port = "/dev/ttyUSB1"', "or none is"),
         ("direction = 1", "direction = 0", "turns nowhere"),
         ("beta = 0.99", "beta = 1e999", "finite"),
     ],
