@@ -135,6 +135,12 @@ class Term:
         """Half width of the term's lobe [rad], None without one."""
         return None if self.model.lobe_width is None else float(self.model.lobe_width(self.values))
 
+    @property
+    def plain(self) -> bool:
+        """Compiled, isotropic and without kinks: what a rule for smooth integrands may take."""
+        model = self.model
+        return model.function is not None and model.isotropic and len(self.kinks(np.array([0.6, 0.0, 0.8]))) == 0
+
     def kinks(self, omega_r: Array) -> Array:
         """Planes ``c . w = d`` of the term's kinks for a reflected direction (3,), shape (k, 4); k = 0 without any."""
         return np.empty((0, 4)) if self.model.kinks is None else self.model.kinks(self.values, omega_r)

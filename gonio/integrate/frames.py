@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,13 +17,20 @@ Array = NDArray[np.float64]
 class Elements:
     """Surface elements seen by the viewer, each array of shape (n,).
 
-    In the local frame the viewer stands at (-sin_theta, 0, cos_theta) and the mirror direction at (sin_theta, 0, cos_theta).
+    In the local frame the viewer stands at (-sin_theta, 0, cos_theta) and the mirror direction at (sin_theta, 0, cos_theta),
+    unless the frame is turned.
+
+    Attributes
+    ----------
+    turn : ndarray, shape (n,), optional
+        Angle [rad] about the normal from there to the x axis of an anisotropic surface, which is then the frame's.
     """
 
     cos_theta: Array
     sin_theta: Array
     cos_phi: Array
     sin_phi: Array
+    turn: Array | None = None
 
     @classmethod
     def from_gradient(cls, p: ArrayLike, q: ArrayLike) -> Elements:
@@ -41,20 +48,34 @@ class Elements:
 
     def select(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Elements:
         """Some of the elements."""
-        return Elements(self.cos_theta[index], self.sin_theta[index], self.cos_phi[index], self.sin_phi[index])
+        turn = None if self.turn is None else self.turn[index]
+        return Elements(self.cos_theta[index], self.sin_theta[index], self.cos_phi[index], self.sin_phi[index], turn)
+
+    def turned(self, tangent: ArrayLike) -> Elements:
+        """With the frames' x axes along the surface's own: `tangent` [rad] about the normal from (1, 0, p), dz along x.
+
+        Seen down the normal the angle runs counter-clockwise; (n,) or a scalar.
+        """
+        # in the local frame (1, 0, p) is along (cos phi, -sin phi cos theta)
+        start = np.arctan2(-self.sin_phi * self.cos_theta, self.cos_phi)
+        return replace(self, turn=np.broadcast_to(start + np.asarray(tangent, dtype=float), start.shape))
 
     def viewer(self) -> Array:
         """Direction of the viewer in the local frame, shape (n, 3)."""
-        return np.stack((-self.sin_theta, np.zeros_like(self.sin_theta), self.cos_theta), axis=-1)
+        return self._turn(-self.sin_theta, np.zeros_like(self.sin_theta), self.cos_theta)
 
     def local(self, direction: Sequence[float]) -> Array:
         """A viewer-oriented direction in the local frames, shape (n, 3) (memo, section 12, in vectors)."""
         x, y, z = direction
         along = x * self.cos_phi + y * self.sin_phi  # 0 exactly for the viewer's axis
         across = y * self.cos_phi - x * self.sin_phi
-        return np.stack(
-            (along * self.cos_theta - z * self.sin_theta, across, along * self.sin_theta + z * self.cos_theta), axis=-1
-        )
+        return self._turn(along * self.cos_theta - z * self.sin_theta, across, along * self.sin_theta + z * self.cos_theta)
+
+    def _turn(self, x: Array, y: Array, z: Array) -> Array:
+        if self.turn is None:
+            return np.stack((x, y, z), axis=-1)
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        return np.stack((c * x + s * y, c * y - s * x, z), axis=-1)
 
     def mirror(self) -> Array:
         """Viewer-oriented direction that a mirror would show, shape (n, 3): theta = 2 theta_n, phi = phi_n."""

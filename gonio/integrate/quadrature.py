@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
+from gonio.integrate.adaptive import over_cap
 from gonio.integrate.cap import ORDERS, cap_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.source import Cap
@@ -68,7 +69,7 @@ def integrate_cap(
     Parameters
     ----------
     term : Term
-        With a function (no delta).
+        With values (no delta). One that is not plain goes to `gonio.integrate.adaptive`.
     cap : Cap
     elements : Elements, length n
     rtol, atol : float
@@ -90,6 +91,8 @@ def integrate_cap(
         If an element would need more than 16 million nodes.
     """
     local = about_normal if about_normal is not None else cap.half_angle > 0.5
+    if not term.plain:
+        return over_cap(term, cap, elements, rtol=rtol, atol=atol, about_normal=local, effort=effort)
     width = term.lobe_width()
     axis_local = elements.local(cap.axis)
     value, error = np.zeros(len(elements)), np.zeros(len(elements))

@@ -1,0 +1,274 @@
+r"""Adaptive quadrature for what has no faster rule: BRDFs with kinks, anisotropic ones, functions of the user's.
+
+The cells of `gonio.integrate.cells` are free of every edge that is known. Each takes the product of two 15-point Kronrod
+rules; what the 7-point Gauss rules inside them miss is its error, so the error of a total is that of a far coarser rule.
+Cells are halved, in the direction that errs, until the errors of an element add up to its tolerance. Before that, cells
+near a declared lobe are halved down to its width, so that no lobe is too narrow to be seen. All elements advance together,
+array by array.
+
+What is not declared, an edge or a lobe in a user's function, is found as far as the nodes hit it.
+
+References
+----------
+.. [1] R. Piessens, E. de Doncker-Kapenga, C. W. Ueberhuber, D. K. Kahaner, QUADPACK, Springer, 1983.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf.base import Term, accumulate
+from gonio.errors import IntegrationError, ParameterError
+from gonio.integrate.cells import COLUMNS, GAUSS, KRONROD, MOST_PLANES, NODES, build, fill, place
+from gonio.integrate.frames import Elements
+from gonio.source import Cap
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Radiance = Callable[[Array, Index], Array]
+EPS = float(np.finfo(float).eps)
+_BLOCK = 64  # elements that advance together
+_CHUNK = 1024  # cells evaluated at once: 30 MiB
+_LARGEST = 1 << 24  # nodes for one element
+_DEEPEST = 2.0**-40  # of a base cell's side
+_RULES = np.stack((KRONROD, GAUSS), axis=1)
+
+
+class Counter(Protocol):
+    """Where the cost is written down."""
+
+    def add(self, nodes: int, order: int) -> None: ...
+
+
+class Region(NamedTuple):
+    """Directions to integrate over, one cap for each element, above the element's horizon.
+
+    Attributes
+    ----------
+    axis : ndarray, shape (n, 3)
+        In the local frames.
+    half_angle : float
+        [rad]; pi is the whole sphere.
+    about_normal : bool
+        Pole of the coordinates: the normal or the cap's axis.
+    """
+
+    axis: Array
+    half_angle: float
+    about_normal: bool
+
+
+def integrate(
+    term: Term,
+    fixed: Array,
+    region: Region,
+    radiance: Radiance | None,
+    *,
+    rtol: float,
+    atol: float,
+    effort: Counter,
+    reverse: bool = False,
+) -> tuple[Array, Array]:
+    r"""Integral of f_r L cos theta over the directions of a region, for each of n elements.
+
+    Parameters
+    ----------
+    term : Term
+        With values (no delta function).
+    fixed : ndarray, shape (n, 3)
+        Unit vectors in the local frames above the horizon: omega_r, while omega_i is integrated over.
+    region : Region
+    radiance : callable, optional
+        ``(directions (m, 3) in the local frames, element (m,)) -> (m,)``; None for 1.
+    rtol, atol : float
+        Tolerance per element. An element that does not reach it keeps its honest error.
+    effort : Counter
+    reverse : bool, optional
+        `fixed` is omega_i, and omega_r is integrated over.
+
+    Returns
+    -------
+    value, error : ndarray, shape (n,)
+
+    Raises
+    ------
+    ParameterError
+        If a user's function returns NaN or infinity, or declares too many planes.
+    IntegrationError
+        If an element would need more than 16 million nodes before its declared lobe is resolved.
+    """
+    n = len(fixed)
+    value, error = np.zeros(n), np.zeros(n)
+    for start in range(0, n, _BLOCK):
+        part = slice(start, min(n, start + _BLOCK))
+        lit = np.arange(n)[part]
+        if region.half_angle < math.pi / 2:
+            lit = lit[region.axis[part, 2] > -math.sin(region.half_angle)]  # others lie below the horizon as a whole
+        if len(lit):
+            block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), radiance, lit, reverse, effort)
+            value[lit], error[lit] = block.run(rtol, atol)
+    return value, error
+
+
+def over_cap(
+    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool, effort: Counter
+) -> tuple[Array, Array]:
+    """Reflected radiance of each element due to one term and one cap: `integrate` with the cap's radiance."""
+    axis, profile = elements.local(cap.axis), cap.profile
+
+    def radiance(directions: Array, element: Index) -> Array:
+        if profile is None:
+            return np.full(len(directions), cap.radiance)
+        return np.asarray(cap.radiance * profile(np.einsum("ij,ij->i", directions, axis[element])))
+
+    region = Region(axis, cap.half_angle, about_normal)
+    return integrate(term, elements.viewer(), region, radiance, rtol=rtol, atol=atol, effort=effort)
+
+
+class _Block:
+    """A few elements, with the cells that cover their regions."""
+
+    def __init__(
+        self,
+        term: Term,
+        fixed: Array,
+        region: Region,
+        radiance: Radiance | None,
+        names: Index,
+        reverse: bool,
+        effort: Counter,
+    ) -> None:
+        self.term, self.fixed, self.radiance, self.names = term, np.ascontiguousarray(fixed), radiance, names
+        self.reverse, self.effort = reverse, effort
+        self.width = term.lobe_width()
+        n, axis = len(fixed), np.ascontiguousarray(region.axis)
+        planes, counts = _planes(term, fixed, region)
+        self.frames, self.circles = np.empty((n, 3, 3)), np.empty((n, planes.shape[1], 3))
+        capacity = 32 * n
+        while True:
+            cells, owner = np.empty((capacity, COLUMNS)), np.empty(capacity, dtype=np.intp)
+            count = build(
+                axis, region.half_angle, region.about_normal, planes, counts, self.frames, self.circles, cells, owner
+            )
+            if count >= 0:
+                break
+            capacity *= 2
+        self.cells, self.owner = cells[:count], owner[:count]
+        self.base = np.arange(count)
+        self.box = np.tile(np.array([0.0, 1.0, 0.0, 1.0]), (count, 1))  # u0, u1, v0, v1
+        if self.width is not None:
+            self._approach_lobe(self.width)
+
+    def _approach_lobe(self, width: float) -> None:
+        """Halve cells near the mirror direction until they are as small as the lobe."""
+        mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
+        at = np.einsum("nij,nj->ni", self.frames, mirror)
+        feature = np.stack((np.arctan2(np.hypot(at[:, 0], at[:, 1]), at[:, 2]), np.arctan2(at[:, 1], at[:, 0])), axis=-1)
+        # across the plane of incidence the lobe is narrower by cos theta_r
+        widths = width * np.maximum(self.fixed[:, 2:3], 0.02)
+        while True:
+            ways = np.empty(len(self.base), dtype=np.int64)
+            place(self.cells, self.owner, self.circles, self.base, self.box, feature[:, None, :], widths, ways)
+            if not np.any(ways):
+                return
+            self.base, self.box = _halve(self.base, self.box, ways)
+            if len(self.base) * NODES.size**2 > _LARGEST * len(self.fixed):
+                raise IntegrationError(
+                    f"{self.term.model.name}: more than {_LARGEST} nodes around its lobe for one gradient"
+                )
+
+    def run(self, rtol: float, atol: float) -> tuple[Array, Array]:
+        """Refine to the tolerance; value and error (n,)."""
+        n = len(self.fixed)
+        value, along, across = self._evaluate(self.base, self.box)
+        spent = np.bincount(self.owner[self.base], minlength=n)
+        while True:
+            element, err = self.owner[self.base], along + across
+            total = np.bincount(element, value, minlength=n).astype(float)
+            missing = np.bincount(element, err, minlength=n).astype(float)
+            tolerance = np.maximum(rtol * np.abs(total), atol)
+            count = np.bincount(element, minlength=n)
+            open_ = (missing > tolerance) & (spent * NODES.size**2 < _LARGEST)
+            split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
+            split &= np.minimum(self.box[:, 1] - self.box[:, 0], self.box[:, 3] - self.box[:, 2]) > _DEEPEST
+            if not np.any(split):
+                relative = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0))
+                return total, missing + relative * np.abs(total)
+            ways = np.where(along > 4 * across, 1, np.where(across > 4 * along, 2, 3)) * split
+            keep = ~split
+            base, box = _halve(self.base[split], self.box[split], ways[split])
+            fresh = self._evaluate(base, box)
+            spent += np.bincount(self.owner[base], minlength=n)
+            self.base, self.box = np.concatenate((self.base[keep], base)), np.concatenate((self.box[keep], box))
+            value, along, across = (np.concatenate((o[keep], f)) for o, f in zip((value, along, across), fresh, strict=True))
+
+    def _evaluate(self, base: Index, box: Array) -> tuple[Array, Array, Array]:
+        """Value of each cell, and its errors along t and along chi."""
+        out = np.empty((3, len(base)))
+        side = NODES.size
+        for start in range(0, len(base), _CHUNK):
+            part = slice(start, min(len(base), start + _CHUNK))
+            size = part.stop - start
+            directions, weights = np.empty((size, side, side, 3)), np.empty((size, side, side))
+            fill(self.cells, self.owner, self.circles, self.frames, base[part], box[part], NODES, directions, weights)
+            flat = directions.reshape(-1, 3)
+            element = np.repeat(self.owner[base[part]], side * side)
+            f_r, fixed = np.zeros(len(flat)), self.fixed[element]
+            pair = (fixed, flat) if self.reverse else (flat, fixed)
+            accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
+            if self.radiance is not None:
+                f_r *= self.radiance(flat, self.names[element])
+            f_r = f_r.reshape(weights.shape) * weights
+            sums = np.einsum("cij,ia,jb->cab", f_r, _RULES, _RULES, optimize=True)
+            if not np.all(np.isfinite(sums)):
+                raise ParameterError(
+                    f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
+                )
+            best = sums[:, 0, 0]
+            out[:, part] = best, np.abs(best - sums[:, 1, 0]), np.abs(best - sums[:, 0, 1])
+            self.effort.add(f_r.size, side)
+        return out[0], out[1], out[2]
+
+
+def _planes(term: Term, fixed: Array, region: Region) -> tuple[Array, Index]:
+    """Centres and half angles (n, m, 4) of the circles that cut each element's region; the clip comes first."""
+    n = len(fixed)
+    rows: list[Array] = []
+    for k in range(n):
+        own = []
+        if not region.about_normal:
+            own.append([[0.0, 0.0, 1.0, math.pi / 2]])
+        elif region.half_angle < math.pi:
+            own.append([[*region.axis[k], region.half_angle]])
+        kinks = term.kinks(fixed[k])
+        kinks = kinks[np.abs(kinks[:, 3]) < 1.0]  # others miss the sphere
+        own.append(np.column_stack((kinks[:, :3], np.arccos(kinks[:, 3]))).tolist())
+        rows.append(np.array([row for group in own for row in group]).reshape(-1, 4))
+    counts = np.array([len(r) for r in rows], dtype=np.intp)
+    if counts.max() > MOST_PLANES:
+        raise ParameterError(f"{term.model.name}: {counts.max()} planes of kinks; at most {MOST_PLANES} can be broken at")
+    planes = np.zeros((n, max(1, int(counts.max())), 4))
+    for k, r in enumerate(rows):
+        planes[k, : len(r)] = r
+    return planes, counts
+
+
+def _halve(base: Index, box: Array, ways: NDArray[np.int64]) -> tuple[Index, Array]:
+    """Cells cut in two along t (1), along chi (2) or in four (3)."""
+    for bit, low in ((1, 0), (2, 2)):
+        cut = (ways & bit) > 0
+        first, second = box.copy(), box[cut].copy()
+        middle = 0.5 * (box[cut, low] + box[cut, low + 1])
+        first[cut, low + 1] = middle
+        second[:, low] = middle
+        base, box, ways = (
+            np.concatenate((base, base[cut])),
+            np.concatenate((first, second)),
+            np.concatenate((ways, ways[cut])),
+        )
+    return base, box
