@@ -137,9 +137,10 @@ class Term:
 
     @property
     def plain(self) -> bool:
-        """Compiled, isotropic and without kinks: what a rule for smooth integrands may take."""
+        """Compiled, isotropic, without kinks and not a user's: what a rule for smooth integrands may take."""
         model = self.model
-        return model.function is not None and model.isotropic and len(self.kinks(np.array([0.6, 0.0, 0.8]))) == 0
+        smooth = len(self.kinks(np.array([0.6, 0.0, 0.8]))) == 0
+        return smooth and model.function is not None and model.isotropic and not model.own
 
     def kinks(self, omega_r: Array) -> Array:
         """Planes ``c . w = d`` of the term's kinks for a reflected direction (3,), shape (k, 4); k = 0 without any."""

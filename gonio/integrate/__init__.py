@@ -14,20 +14,20 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gonio.brdf.base import BRDF
-from gonio.errors import GeometryError, IntegrationError, ParameterError
+from gonio.errors import GeometryError, ParameterError
 from gonio.fields import Field
 from gonio.geometry import normal_from_gradient
-from gonio.integrate import closed_forms, radial
+from gonio.integrate import closed_forms, radial, viewpoint
 from gonio.integrate.field_quadrature import integrate_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.plan import Method, Step, plan
 from gonio.integrate.quadrature import integrate_cap
+from gonio.integrate.results import Estimate, MapValues, insist
 from gonio.source import Collimated, Source, uniform
 
 __all__ = ["Estimate", "MapValues", "directional_albedo", "plan", "reflectance_map", "scene_radiance"]
@@ -36,34 +36,16 @@ Array = NDArray[np.float64]
 _FEW = 64  # distinct slopes below which a table in theta_n does not pay
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A value with its error: `error` is an estimate that aims never to understate ``abs(value - truth)``."""
-
-    value: Array
-    error: Array
-
-
-@dataclass(frozen=True)
-class MapValues(Estimate):
-    """A reflectance map on given gradients.
-
-    Attributes
-    ----------
-    value, error : ndarray, shape of broadcast(p, q)
-        Scene radiance [W m^-2 sr^-1] without the impulses.
-    impulses : list of (p, q, weight)
-        Delta functions: weight is the coefficient of delta(p - p1) delta(q - q1).
-    plan : list of Step
-        What was done.
-    """
-
-    impulses: list[tuple[float, float, float]]
-    plan: list[Step]
-
-
 def reflectance_map(
-    brdf: BRDF, source: Source, p: ArrayLike, q: ArrayLike, rtol: float = 1e-6, atol: float = 0.0
+    brdf: BRDF,
+    source: Source,
+    p: ArrayLike,
+    q: ArrayLike,
+    rtol: float = 1e-6,
+    atol: float = 0.0,
+    *,
+    tangent: ArrayLike | None = None,
+    viewer: tuple[float, float] | None = None,
 ) -> MapValues:
     r"""Reflectance map R(p, q): scene radiance as a function of the surface gradient.
 
@@ -76,6 +58,12 @@ def reflectance_map(
         Surface gradient dz/dx, dz/dy [1].
     rtol, atol : float, optional
         Relative and absolute [W m^-2 sr^-1] error requested.
+    tangent : array_like, broadcasts with p and q, optional
+        For an anisotropic BRDF: how far its x axis is rotated about the normal [rad], counter-clockwise seen from outside,
+        from the surface's direction (1, 0, p), that is along x.
+    viewer : (theta, phi), optional
+        Direction of a distant viewer off the z axis [rad], in the coordinates of source and gradients; R is 0 where the
+        surface faces away. Fields then cost a quadrature per gradient.
 
     Returns
     -------
@@ -86,6 +74,8 @@ def reflectance_map(
     ------
     GeometryError
         If a gradient is NaN or both of its components are infinite.
+    ParameterError
+        If the BRDF is anisotropic and `tangent` is missing.
     IntegrationError
         If the tolerance is not met; ``exc.best`` is the `MapValues` reached, with its errors.
 
@@ -101,7 +91,12 @@ def reflectance_map(
     if not (math.isfinite(rtol) and rtol > 0 and math.isfinite(atol) and atol >= 0):
         raise ParameterError(f"rtol = {rtol:g} and atol = {atol:g}: rtol must be positive, atol zero or positive")
     p, q = np.broadcast_arrays(np.asarray(p, dtype=float), np.asarray(q, dtype=float))
+    if tangent is not None:
+        p, q, tangent = np.broadcast_arrays(p, q, np.asarray(tangent, dtype=float))
+    if viewer is not None:
+        return viewpoint.seen_from(viewer, brdf, source, p, q, rtol, atol, tangent)
     elements = Elements.from_gradient(p.ravel(), q.ravel())
+    grained = viewpoint.with_grain(brdf, elements, None if tangent is None else np.ravel(tangent))
     theta_n = normal_from_gradient(p.ravel(), q.ravel())[0]
     value, error = np.zeros(len(elements)), np.zeros(len(elements))
     impulses: list[tuple[float, float, float]] = []
@@ -113,21 +108,15 @@ def reflectance_map(
             assert isinstance(step.part, Collimated)
             impulses += closed_forms.mirror_beam(step.term, step.part)
             continue
-        v, e = _run(step, elements, theta_n, rtol, atol * share)
+        own = elements if step.term.model.isotropic else grained
+        v, e = _run(step, own, theta_n, rtol, atol * share)
         value += v
         error += e
         step.seconds = time.perf_counter() - start
         step.error = float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
-    result = MapValues(value.reshape(p.shape), error.reshape(p.shape), impulses, steps)
-    missed = error > np.maximum(rtol * np.abs(value), atol) * (1 + 1e-9) + 1e-300
-    if np.any(missed & (error > 1e-13 * np.max(np.abs(value), initial=0.0))):
-        worst = float(np.max(np.divide(error, np.abs(value), out=np.zeros_like(error), where=value != 0)))
-        raise IntegrationError(
-            f"reflectance map: reached a relative error of {worst:.1e} where {rtol:.1e} was asked for, at "
-            f"{int(missed.sum())} of {len(value)} gradients; ask for a larger rtol or use the result in exc.best",
-            result,
-        )
-    return result
+    bound = not viewpoint.depends_on_user(brdf, Source.of(source))
+    result = MapValues(value.reshape(p.shape), error.reshape(p.shape), impulses, steps, error_is_bound=bound)
+    return insist(result, rtol, atol)
 
 
 def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: float) -> tuple[Array, Array]:
@@ -170,7 +159,14 @@ def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: floa
 
 
 def scene_radiance(
-    brdf: BRDF, source: Source, theta_n: ArrayLike, phi_n: ArrayLike, *, form: str = "local", rtol: float = 1e-6
+    brdf: BRDF,
+    source: Source,
+    theta_n: ArrayLike,
+    phi_n: ArrayLike,
+    *,
+    form: str = "local",
+    rtol: float = 1e-6,
+    tangent: ArrayLike | None = None,
 ) -> Estimate:
     """The general integral of the memo's section 13 by quadrature, in either of its two forms.
 
@@ -189,6 +185,8 @@ def scene_radiance(
         hemispherical sources is the viewer's.
     rtol : float, optional
         Relative error requested.
+    tangent : array_like, broadcasts with theta_n and phi_n, optional
+        As for `reflectance_map`, for an anisotropic BRDF.
 
     Returns
     -------
@@ -198,11 +196,16 @@ def scene_radiance(
     if form not in ("local", "viewer"):
         raise ParameterError(f"form = {form!r}; the memo has two: 'local' and 'viewer'")
     theta, phi = np.broadcast_arrays(np.asarray(theta_n, dtype=float), np.asarray(phi_n, dtype=float))
+    if tangent is not None:
+        theta, phi, tangent = np.broadcast_arrays(theta, phi, np.asarray(tangent, dtype=float))
     if not np.all((theta >= 0) & (theta <= np.pi / 2)):
         raise GeometryError("theta_n must be within 0 and 90 degrees")
-    elements = Elements.from_polar(theta.ravel(), phi.ravel())
-    value, error = np.zeros(len(elements)), np.zeros(len(elements))
+    upright = Elements.from_polar(theta.ravel(), phi.ravel())
+    grained = viewpoint.with_grain(brdf, upright, None if tangent is None else np.ravel(tangent))
+    source = Source.of(source)
+    value, error = np.zeros(len(upright)), np.zeros(len(upright))
     for step in plan(brdf, source):
+        elements = upright if step.term.model.isotropic else grained
         if isinstance(step.part, Collimated):
             raise ParameterError("a collimated beam is a delta function: its integral is closed form 14a, not a quadrature")
         if isinstance(step.part, Field):
@@ -213,7 +216,8 @@ def scene_radiance(
             step.term, step.part, elements, rtol=rtol, atol=0.0, about_normal=form == "local", effort=step.effort
         )
         value, error = value + v, error + e
-    return Estimate(value.reshape(theta.shape), error.reshape(theta.shape))
+    bound = not viewpoint.depends_on_user(brdf, source)
+    return Estimate(value.reshape(theta.shape), error.reshape(theta.shape), error_is_bound=bound)
 
 
 def directional_albedo(brdf: BRDF, theta_r: ArrayLike, *, rtol: float = 1e-6) -> Estimate:

@@ -24,6 +24,9 @@ class Elements:
     ----------
     turn : ndarray, shape (n,), optional
         Angle [rad] about the normal from there to the x axis of an anisotropic surface, which is then the frame's.
+    view : ndarray, shape (3, 3), optional
+        For a viewer off the axis: the rotation that takes his direction to z. The normals are in his coordinates then,
+        while the directions given to `local`, and those that `mirror` returns, are in the scene's.
     """
 
     cos_theta: Array
@@ -31,6 +34,7 @@ class Elements:
     cos_phi: Array
     sin_phi: Array
     turn: Array | None = None
+    view: Array | None = None
 
     @classmethod
     def from_gradient(cls, p: ArrayLike, q: ArrayLike) -> Elements:
@@ -49,7 +53,8 @@ class Elements:
     def select(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Elements:
         """Some of the elements."""
         turn = None if self.turn is None else self.turn[index]
-        return Elements(self.cos_theta[index], self.sin_theta[index], self.cos_phi[index], self.sin_phi[index], turn)
+        cosines = (self.cos_theta[index], self.sin_theta[index], self.cos_phi[index], self.sin_phi[index])
+        return Elements(*cosines, turn=turn, view=self.view)
 
     def turned(self, tangent: ArrayLike) -> Elements:
         """With the frames' x axes along the surface's own: `tangent` [rad] about the normal from (1, 0, p), dz along x.
@@ -66,7 +71,7 @@ class Elements:
 
     def local(self, direction: Sequence[float]) -> Array:
         """A viewer-oriented direction in the local frames, shape (n, 3) (memo, section 12, in vectors)."""
-        x, y, z = direction
+        x, y, z = direction if self.view is None else self.view @ np.asarray(direction, dtype=float)
         along = x * self.cos_phi + y * self.sin_phi  # 0 exactly for the viewer's axis
         across = y * self.cos_phi - x * self.sin_phi
         return self._turn(along * self.cos_theta - z * self.sin_theta, across, along * self.sin_theta + z * self.cos_theta)
@@ -81,4 +86,5 @@ class Elements:
         """Viewer-oriented direction that a mirror would show, shape (n, 3): theta = 2 theta_n, phi = phi_n."""
         s2 = 2.0 * self.sin_theta * self.cos_theta
         c2 = (self.cos_theta - self.sin_theta) * (self.cos_theta + self.sin_theta)
-        return np.stack((s2 * self.cos_phi, s2 * self.sin_phi, c2), axis=-1)
+        seen = np.stack((s2 * self.cos_phi, s2 * self.sin_phi, c2), axis=-1)
+        return seen if self.view is None else np.asarray(seen @ self.view)
