@@ -93,7 +93,7 @@ class ReflectanceMap:
         Returns
         -------
         Estimate
-            ``value`` and ``error``, shape (...) [W m^-2 sr^-1]. The error of an interpolated value is a bound for
+            ``value`` and ``error``, shape (...) [W m^-2 sr^-1]. The error of an interpolated value covers
             structures that the grid resolves; what is narrower than its spacing it cannot know.
 
         Raises
@@ -109,9 +109,10 @@ class ReflectanceMap:
         if self._integrates(method):
             assert self.brdf is not None and self.source is not None
             exact = reflectance_map(self.brdf, self.source, p, q, rtol=rtol)
-            return Estimate(exact.value, exact.error)
+            return Estimate(exact.value, exact.error, error_is_bound=exact.error_is_bound)
         if np.any(np.isnan(p)) or np.any(np.isnan(q)):
             raise GeometryError("a gradient is NaN: give finite p and q")
+        self.interpolant  # noqa: B018  checks axes and shapes
         for name, x, axis in (("p", p, self.p), ("q", q, self.q)):
             outside = (x < axis[0]) | (x > axis[-1])
             if np.any(outside):
@@ -186,16 +187,16 @@ class ReflectanceMap:
         value, error = np.full(p.shape, np.nan), np.full(p.shape, np.nan)
         part = self._at(p[seen], q[seen], method, rtol)
         value[seen], error[seen] = part.value, part.error
-        return Estimate(value, error)
+        return Estimate(value, error, error_is_bound=part.error_is_bound)
 
     def _at(self, p: Array, q: Array, method: Method, rtol: float) -> Estimate:
         """Value and honest error, whether or not the tolerance is met; NaN outside a map without a scene."""
         if self._integrates(method):
             assert self.brdf is not None and self.source is not None
             best = _evaluate(self.brdf, self.source, p, q, rtol, True)
-            return Estimate(best.value, best.error)
+            return Estimate(best.value, best.error, error_is_bound=best.error_is_bound)
         value, _, error = self.interpolant(p.ravel(), q.ravel())
-        return Estimate(value[:, 0].reshape(p.shape), error[:, 0].reshape(p.shape))
+        return Estimate(value[:, 0].reshape(p.shape), error[:, 0].reshape(p.shape), error_is_bound=False)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write NetCDF-4; the file appears whole or not at all."""
@@ -259,7 +260,7 @@ class ReflectanceMap:
 
 def compute(
     brdf: BRDF,
-    source: Source,
+    source: Source | Callable[[Array], ArrayLike],
     p: Array,
     q: Array,
     *,
@@ -274,7 +275,7 @@ def compute(
     Parameters
     ----------
     brdf : BRDF
-    source : Source
+    source : Source or callable
     p, q : ndarray, shapes (n,) and (m,)
         Axes of the grid.
     rtol : float, optional
@@ -299,7 +300,7 @@ def compute(
     """
     if p.ndim != 1 or q.ndim != 1 or p.size < 2 or q.size < 2:
         raise ParameterError("a map needs two axes of at least two gradients each")
-    p_all, q_all = p[None, :], q[:, None]
+    source, p_all, q_all = Source.of(source), p[None, :], q[:, None]
     values = _evaluate(brdf, source, p_all, q_all, rtol, tolerant)
     stack = []
     for count, draw in enumerate(draws, 1):

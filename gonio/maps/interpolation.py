@@ -148,7 +148,7 @@ class _Axis:
     def differences(self, value: Array, order: int) -> Array:
         """Largest difference of some order near each cell, along the last axis: (..., n) -> (..., n - 1)."""
         n = self.at.size
-        order = min(order, n - 1)
+        order = min(order, max(n - 2, 1))  # two at least, as a single one may vanish by chance
         table = value
         for k in range(1, order + 1):
             table = np.diff(table, axis=-1) / (self.at[k:] - self.at[:-k])

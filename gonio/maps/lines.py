@@ -86,6 +86,7 @@ def _onto(reflectance_map: ReflectanceMap, at: Array, level: Array, rtol: float,
     cell = [np.clip(np.searchsorted(a, at[:, k], side="right") - 1, 0, a.size - 2) for k, a in enumerate((p, q))]
     reach = 0.5 * np.stack((np.diff(p)[cell[0]], np.diff(q)[cell[1]]), axis=-1)
     lower, upper = np.maximum(at - reach, (p[0], q[0])), np.minimum(at + reach, (p[-1], q[-1]))
+    free = (at > (p[0], q[0])) & (at < (p[-1], q[-1]))  # the end of a line slides along the border of the map
     best, missing = at.copy(), np.full(len(at), np.inf)
     trial, pending = at.copy(), np.arange(len(at))
     for _ in range(_STEPS + 1):
@@ -94,7 +95,7 @@ def _onto(reflectance_map: ReflectanceMap, at: Array, level: Array, rtol: float,
         off = level[pending] - value
         nearer = np.abs(off) < missing[pending]
         best[pending[nearer]], missing[pending[nearer]] = here[nearer], np.abs(off[nearer])
-        slope = reflectance_map.interpolant(here[:, 0], here[:, 1])[1][:, 0]
+        slope = reflectance_map.interpolant(here[:, 0], here[:, 1])[1][:, 0] * free[pending]
         steepness = np.sum(slope**2, axis=-1)
         move = np.divide(off, steepness, out=np.zeros_like(off), where=steepness > 0)[:, None] * slope
         trial[pending] = np.clip(here + np.nan_to_num(move), lower[pending], upper[pending])

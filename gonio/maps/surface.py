@@ -59,7 +59,8 @@ def gradients_of_heights(z: ArrayLike, spacing: float | Sequence[float]) -> tupl
         raise GeometryError(f"spacing = {spacing}; give one number or (dx, dy), finite and not zero, in the unit of z")
     dx, dy = (float(step) for step in steps)
     q, p = np.gradient(heights, dy, dx, edge_order=2)
-    return np.asarray(p), np.asarray(q)
+    holes = np.isnan(heights)  # central differences step over the point itself
+    return np.where(holes, np.nan, p), np.where(holes, np.nan, q)
 
 
 def gradients_of_normals(normals: ArrayLike) -> tuple[Array, Array]:
