@@ -185,9 +185,6 @@ def _page(
     if summary:
         rows = "".join(f'<tr><th scope="row">{_text(label)}</th><td>{_text(value)}</td></tr>' for label, value in summary)
         parts.append(f"<h2>Summary</h2><table><tbody>{rows}</tbody></table>")
-    if tables:
-        parts.append("<h2>Tables</h2>")
-        parts.extend(_table(table) for table in tables)
     if figures:
         parts.append("<h2>Figures</h2>")
     for number, (caption, figure) in enumerate(figures, 1):
@@ -197,6 +194,9 @@ def _page(
             f'<figure><img width="{width}" alt="{_text(caption)}" src="data:image/png;base64,{picture}">'
             f"<figcaption><b>Fig. {number}.</b> {_text(caption)}</figcaption></figure>"
         )
+    if tables:
+        parts.append("<h2>Tables</h2>")
+        parts.extend(_table(table) for table in tables)
     if documents:
         parts.append("<h2>Documents</h2>")
     for name, text in documents.items():
