@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from gonio.brdf.base import BRDF, Model, Parameter, Term, _suggest, term_names
 from gonio.brdf.function import from_function
 from gonio.brdf.lambertian import LAMBERTIAN
@@ -22,17 +24,16 @@ def models() -> dict[str, Model]:
     return dict(_MODELS)
 
 
-def make(name: str, *, variant: str | None = None, **parameters: float) -> BRDF:
+def make(name: str, **parameters: Any) -> BRDF:
     """A BRDF of one model.
 
     Parameters
     ----------
     name : str
         A key of `models`.
-    variant : str, optional
-        Of models that come in several: oren_nayar ("qualitative").
     **parameters : float
-        All parameters of the model; angles in radians.
+        All parameters of the model; angles in radians. Also ``variant=`` of models that come in several: oren_nayar
+        ("qualitative").
 
     Raises
     ------
@@ -44,12 +45,12 @@ def make(name: str, *, variant: str | None = None, **parameters: float) -> BRDF:
     >>> make("lambertian", albedo=0.8) + make("ggx", k_s=1.0, alpha=0.3, f_0=0.04)
     lambertian(albedo=0.8) + ggx(k_s=1, alpha=0.3, f_0=0.04)
     """
-    model = find(name)
+    model, variant = find(name), parameters.pop("variant", None)
     if variant is not None:
         if (name, variant) not in _VARIANTS:
             known = sorted(v for n, v in _VARIANTS if n == name)
             raise ParameterError(
-                f"{name} has no variant {variant!r}{_suggest(variant, known)}; "
+                f"{name} has no variant {variant!r}{_suggest(str(variant), known)}; "
                 + (f"it has: {', '.join(known)}" if known else "leave it out")
             )
         model = _VARIANTS[name, variant]
