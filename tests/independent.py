@@ -336,7 +336,7 @@ class _Rings:
                 raise ArithmeticError("a ring does not converge")
         return done
 
-    def integral(self, f: Callable[[Array, Array, Array], Array], rtol: float = 1e-13) -> float:
+    def integral(self, f: Callable[[Array, Array, Array], Array], rtol: float) -> float:
         """Integral of f over the lit part of the sphere, d omega."""
         edges = self.breaks()
         a, b = edges[:-1], edges[1:]  # of the smooth interval that a panel belongs to
@@ -409,7 +409,7 @@ def _pole(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> Array
     return narrow[-1][1]
 
 
-def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: str) -> float:
+def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: str, rtol: float) -> float:
     if part["kind"] == "collimated":
         w = _axis(part)
         mu_i = float(w @ surface.normal)
@@ -426,14 +426,14 @@ def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: 
         return term["rho"] * float(np.where(found.inside(direction), _radiance(part, direction), 0.0)[0])
     if method == "normal":
         rings = _Rings(surface.tangent, surface.normal, found, RULES["normal"])
-        return rings.integral(lambda t, u, w: _by_angles(term, surface, t, u) * np.cos(t) * _radiance(part, w))
+        return rings.integral(lambda t, u, w: _by_angles(term, surface, t, u) * np.cos(t) * _radiance(part, w), rtol)
     pole = _pole(term, part, surface)
     side = min((surface.mirror, surface.normal), key=lambda d: abs(float(d @ pole)))  # azimuth 0, away from the pole
     if abs(float(side @ pole)) > 0.999:
         side = np.roll(pole, 1) + np.array([0.1, 0.0, 0.0])
     rings = _Rings(side, pole, found, RULES["other"])
     return rings.integral(
-        lambda t, u, w: _by_vectors(term, surface, w) * np.maximum(0.0, w @ surface.normal) * _radiance(part, w)
+        lambda t, u, w: _by_vectors(term, surface, w) * np.maximum(0.0, w @ surface.normal) * _radiance(part, w), rtol
     )
 
 
@@ -450,7 +450,7 @@ def _single(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def reflected_radiance(scene: dict[str, Any], method: str) -> float:
-    """Scene radiance without delta functions [W m^-2 sr^-1], by method "normal" or "other"."""
+def reflected_radiance(scene: dict[str, Any], method: str, rtol: float = 1e-13) -> float:
+    """Scene radiance without delta functions [W m^-2 sr^-1], by method "normal" or "other", each panel to `rtol` of it."""
     surface = Surface(scene["p"], scene["q"])
-    return math.fsum(_pair(t, s, surface, method) for t in scene["brdf"] for s in _single(scene["source"]))
+    return math.fsum(_pair(t, s, surface, method, rtol) for t in scene["brdf"] for s in _single(scene["source"]))
