@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.errors import IntegrationError
+from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate.plan import Step
 
 Array = NDArray[np.float64]
@@ -49,8 +49,16 @@ class MapValues(Estimate):
 
 
 def insist(result: MapValues, rtol: float, atol: float) -> MapValues:
-    """The result, or an `IntegrationError` that carries it where its error exceeds the tolerance."""
+    """The result, or an `IntegrationError` that carries it where its error exceeds the tolerance.
+
+    Raises
+    ------
+    ParameterError
+        If a value is NaN or infinite, which only a function of the user's can make it.
+    """
     value, error = result.value, result.error
+    if not np.all(np.isfinite(value)):
+        raise ParameterError("f_r or the radiance is NaN or infinite for a direction above the horizon; both must be finite")
     missed = error > np.maximum(rtol * np.abs(value), atol) * (1 + 1e-9) + 1e-300
     if np.any(missed & (error > 1e-13 * np.max(np.abs(value), initial=0.0))):
         worst = float(np.max(np.divide(error, np.abs(value), out=np.zeros_like(error), where=value != 0)))
