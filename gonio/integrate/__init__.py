@@ -23,7 +23,7 @@ from gonio.errors import GeometryError, ParameterError
 from gonio.fields import Field
 from gonio.geometry import normal_from_gradient
 from gonio.integrate import closed_forms, radial, viewpoint
-from gonio.integrate.field_quadrature import integrate_field
+from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.plan import Method, Step, plan
 from gonio.integrate.quadrature import integrate_cap
@@ -130,7 +130,7 @@ def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: floa
     if step.method is Method.MIRROR:
         return closed_forms.mirror_cap(term, part, elements)
     if isinstance(part, Field):
-        return integrate_field(term, part, elements, rtol=rtol, atol=atol, effort=step.effort)
+        return over_field(term, part, elements, rtol=rtol, atol=atol, effort=step.effort)
     if step.method is Method.LAMBERT:
         return closed_forms.lambertian_cap(term, part, elements)
     if step.method is Method.RADIAL:
@@ -209,7 +209,7 @@ def scene_radiance(
         if isinstance(step.part, Collimated):
             raise ParameterError("a collimated beam is a delta function: its integral is closed form 14a, not a quadrature")
         if isinstance(step.part, Field):
-            v, e = integrate_field(step.term, step.part, elements, rtol=rtol, atol=0.0, effort=step.effort)
+            v, e = over_field(step.term, step.part, elements, rtol=rtol, atol=0.0, effort=step.effort)
             value, error = value + v, error + e
             continue
         v, e = integrate_cap(

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError, ParameterError
+from gonio.fields import EnvironmentMap, Field, Lobes
 from gonio.integrate.cells import COLUMNS, GAUSS, KRONROD, MOST_PLANES, NODES, build, fill, place
 from gonio.integrate.frames import Elements
 from gonio.source import Cap
@@ -63,11 +64,40 @@ class Region(NamedTuple):
     about_normal: bool
 
 
+class Light(NamedTuple):
+    """Radiance as a function of direction, and what is known of its structure.
+
+    Attributes
+    ----------
+    radiance : callable
+        ``(directions (m, 3) in the local frames, element (m,)) -> (m,)``.
+    peaks : ndarray, shape (n, f, 3)
+        Directions in the local frames around which it is concentrated.
+    widths : ndarray, shape (f,)
+        Their half widths [rad].
+    planes : ndarray, shape (n, j, 4)
+        Circles across which a derivative jumps: centre in the local frames, half angle.
+    detail : float
+        Size of its finest structure elsewhere [rad].
+    """
+
+    radiance: Radiance
+    peaks: Array | None = None
+    widths: Array | None = None
+    planes: Array | None = None
+    detail: float = math.inf
+
+    def select(self, index: Index) -> Light:
+        """For some of the elements; the numbers that `radiance` is given stay those of all."""
+        peaks, planes = (None if a is None else a[index] for a in (self.peaks, self.planes))
+        return self._replace(peaks=peaks, planes=planes)
+
+
 def integrate(
     term: Term,
     fixed: Array,
     region: Region,
-    radiance: Radiance | None,
+    light: Light | None,
     *,
     rtol: float,
     atol: float,
@@ -83,8 +113,8 @@ def integrate(
     fixed : ndarray, shape (n, 3)
         Unit vectors in the local frames above the horizon: omega_r, while omega_i is integrated over.
     region : Region
-    radiance : callable, optional
-        ``(directions (m, 3) in the local frames, element (m,)) -> (m,)``; None for 1.
+    light : Light, optional
+        None for a radiance of 1.
     rtol, atol : float
         Tolerance per element. An element that does not reach it keeps its honest error.
     effort : Counter
@@ -104,13 +134,15 @@ def integrate(
     """
     n = len(fixed)
     value, error = np.zeros(n), np.zeros(n)
-    for start in range(0, n, _BLOCK):
-        part = slice(start, min(n, start + _BLOCK))
+    size = _BLOCK if light is None or light.planes is None else max(1, _BLOCK // (1 + light.planes.shape[1]))
+    for start in range(0, n, size):
+        part = slice(start, min(n, start + size))
         lit = np.arange(n)[part]
         if region.half_angle < math.pi / 2:
             lit = lit[region.axis[part, 2] > -math.sin(region.half_angle)]  # others lie below the horizon as a whole
         if len(lit):
-            block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), radiance, lit, reverse, effort)
+            here = None if light is None else light.select(lit)
+            block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), here, lit, reverse, effort)
             value[lit], error[lit] = block.run(rtol, atol)
     return value, error
 
@@ -127,7 +159,37 @@ def over_cap(
         return np.asarray(cap.radiance * profile(np.einsum("ij,ij->i", directions, axis[element])))
 
     region = Region(axis, cap.half_angle, about_normal)
-    return integrate(term, elements.viewer(), region, radiance, rtol=rtol, atol=atol, effort=effort)
+    return integrate(term, elements.viewer(), region, Light(radiance), rtol=rtol, atol=atol, effort=effort)
+
+
+def over_field(
+    term: Term, field: Field, elements: Elements, *, rtol: float, atol: float, effort: Counter
+) -> tuple[Array, Array]:
+    """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared."""
+    n = len(elements)
+    # (n, 3, 3), from viewer-oriented to local
+    turn = np.stack([elements.local(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
+
+    def radiance(directions: Array, element: Index) -> Array:
+        return field.at(np.einsum("ij,ijk->ik", directions, turn[element]))
+
+    light, region = Light(radiance), Region(turn[:, :, 2], math.pi, True)
+    if isinstance(field, Lobes):
+        lit = field.amplitude > 0
+        peaks = np.einsum("nij,fj->nfi", turn, field.axes()[lit])
+        light = light._replace(peaks=peaks, widths=1.0 / np.sqrt(np.maximum(field.kappa[lit], 1.0)))
+    elif isinstance(field, EnvironmentMap):  # panels between rows, cells between columns
+        rows, columns = field.samples.shape
+        phi = np.unique(np.mod((np.arange(columns) + 0.5) * (2.0 * np.pi / columns), np.pi).round(12))
+        circles = [(0.0, 0.0, 1.0, (i + 0.5) * math.pi / rows) for i in range(rows)]
+        circles += [(-math.sin(f), math.cos(f), 0.0, math.pi / 2) for f in phi]
+        fixed = np.array(circles)
+        centres = np.einsum("nij,fj->nfi", turn, fixed[:, :3])
+        light = light._replace(planes=np.concatenate((centres, np.tile(fixed[None, :, 3:], (n, 1, 1))), axis=2))
+        region = Region(turn[:, :, 2], math.pi, False)
+    else:
+        light = light._replace(detail=field.detail)
+    return integrate(term, elements.viewer(), region, light, rtol=rtol, atol=atol, effort=effort)
 
 
 class _Block:
@@ -138,16 +200,16 @@ class _Block:
         term: Term,
         fixed: Array,
         region: Region,
-        radiance: Radiance | None,
+        light: Light | None,
         names: Index,
         reverse: bool,
         effort: Counter,
     ) -> None:
-        self.term, self.fixed, self.radiance, self.names = term, np.ascontiguousarray(fixed), radiance, names
+        self.term, self.fixed, self.light, self.names = term, np.ascontiguousarray(fixed), light, names
         self.reverse, self.effort = reverse, effort
         self.width = term.lobe_width()
         n, axis = len(fixed), np.ascontiguousarray(region.axis)
-        planes, counts = _planes(term, fixed, region)
+        planes, counts = _planes(term, fixed, region, light)
         self.frames, self.circles = np.empty((n, 3, 3)), np.empty((n, planes.shape[1], 3))
         capacity = 32 * n
         while True:
@@ -161,19 +223,36 @@ class _Block:
         self.cells, self.owner = cells[:count], owner[:count]
         self.base = np.arange(count)
         self.box = np.tile(np.array([0.0, 1.0, 0.0, 1.0]), (count, 1))  # u0, u1, v0, v1
-        if self.width is not None:
-            self._approach_lobe(self.width)
+        self._approach_features()
 
-    def _approach_lobe(self, width: float) -> None:
-        """Halve cells near the mirror direction until they are as small as the lobe."""
-        mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
-        at = np.einsum("nij,nj->ni", self.frames, mirror)
-        feature = np.stack((np.arctan2(np.hypot(at[:, 0], at[:, 1]), at[:, 2]), np.arctan2(at[:, 1], at[:, 0])), axis=-1)
-        # across the plane of incidence the lobe is narrower by cos theta_r
-        widths = width * np.maximum(self.fixed[:, 2:3], 0.02)
+    def _approach_features(self) -> None:
+        """Halve cells near the mirror direction and the light's peaks until they are as small as these."""
+        feature, widths = [], []
+        if self.width is not None:
+            mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
+            feature.append(mirror[:, None, :])
+            # across the plane of incidence the lobe is narrower by cos theta_r
+            widths.append(self.width * np.maximum(self.fixed[:, 2:3], 0.02))
+        if self.light is not None and self.light.peaks is not None and self.light.widths is not None:
+            feature.append(self.light.peaks)
+            widths.append(np.broadcast_to(self.light.widths, self.light.peaks.shape[:2]))
+        at = (
+            np.einsum("nij,nfj->nfi", self.frames, np.concatenate(feature, axis=1))
+            if feature
+            else np.empty((len(self.fixed), 0, 3))
+        )
+        where = np.stack(
+            (np.arctan2(np.hypot(at[..., 0], at[..., 1]), at[..., 2]), np.arctan2(at[..., 1], at[..., 0])), axis=-1
+        )
+        if self.light is not None and self.light.detail < math.pi:
+            where = np.concatenate((where, np.full((len(where), 1, 2), -1.0)), axis=1)
+            widths.append(np.full((len(where), 1), 1.5 * self.light.detail))
+        if not widths:
+            return
+        half = np.ascontiguousarray(np.concatenate(widths, axis=1))
         while True:
             ways = np.empty(len(self.base), dtype=np.int64)
-            place(self.cells, self.owner, self.circles, self.base, self.box, feature[:, None, :], widths, ways)
+            place(self.cells, self.owner, self.circles, self.base, self.box, where, half, ways)
             if not np.any(ways):
                 return
             self.base, self.box = _halve(self.base, self.box, ways)
@@ -191,7 +270,7 @@ class _Block:
             element, err = self.owner[self.base], along + across
             total = np.bincount(element, value, minlength=n).astype(float)
             missing = np.bincount(element, err, minlength=n).astype(float)
-            tolerance = np.maximum(rtol * np.abs(total), atol)
+            tolerance = np.maximum(0.95 * rtol * np.abs(total), atol)  # rounding comes on top
             count = np.bincount(element, minlength=n)
             open_ = (missing > tolerance) & (spent * NODES.size**2 < _LARGEST)
             split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
@@ -221,8 +300,8 @@ class _Block:
             f_r, fixed = np.zeros(len(flat)), self.fixed[element]
             pair = (fixed, flat) if self.reverse else (flat, fixed)
             accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
-            if self.radiance is not None:
-                f_r *= self.radiance(flat, self.names[element])
+            if self.light is not None:
+                f_r *= self.light.radiance(flat, self.names[element])
             f_r = f_r.reshape(weights.shape) * weights
             sums = np.einsum("cij,ia,jb->cab", f_r, _RULES, _RULES, optimize=True)
             if not np.all(np.isfinite(sums)):
@@ -235,7 +314,7 @@ class _Block:
         return out[0], out[1], out[2]
 
 
-def _planes(term: Term, fixed: Array, region: Region) -> tuple[Array, Index]:
+def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tuple[Array, Index]:
     """Centres and half angles (n, m, 4) of the circles that cut each element's region; the clip comes first."""
     n = len(fixed)
     rows: list[Array] = []
@@ -247,11 +326,13 @@ def _planes(term: Term, fixed: Array, region: Region) -> tuple[Array, Index]:
             own.append([[*region.axis[k], region.half_angle]])
         kinks = term.kinks(fixed[k])
         kinks = kinks[np.abs(kinks[:, 3]) < 1.0]  # others miss the sphere
+        if len(kinks) > MOST_PLANES:
+            raise ParameterError(f"{term.model.name}: {len(kinks)} planes of kinks; at most {MOST_PLANES} can be broken at")
         own.append(np.column_stack((kinks[:, :3], np.arccos(kinks[:, 3]))).tolist())
+        if light is not None and light.planes is not None:
+            own.append(light.planes[k].tolist())
         rows.append(np.array([row for group in own for row in group]).reshape(-1, 4))
     counts = np.array([len(r) for r in rows], dtype=np.intp)
-    if counts.max() > MOST_PLANES:
-        raise ParameterError(f"{term.model.name}: {counts.max()} planes of kinks; at most {MOST_PLANES} can be broken at")
     planes = np.zeros((n, max(1, int(counts.max())), 4))
     for k, r in enumerate(rows):
         planes[k, : len(r)] = r

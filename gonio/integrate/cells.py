@@ -132,9 +132,9 @@ def _build(axis, half_angle, about_normal, planes, counts, frames, circles, cell
                 y = h * (math.cos(chi) * e[0, 1] + math.sin(chi) * e[1, 1]) + math.cos(turn) * e[2, 1]
                 z = h * (math.cos(chi) * e[0, 2] + math.sin(chi) * e[1, 2]) + math.cos(turn) * e[2, 2]
                 t = abs(turn) if turn <= math.pi else two_pi - turn
-                if (clipped and j == 0) or _allowed(x, y, z, axis[k], rim):
+                if (clipped and j == 0) or gamma <= 1e-9 or _allowed(x, y, z, axis[k], rim):
                     n_t = _add(points, n_t, t, t_end)
-                    if gamma > 1e-9:
+                    if gamma > 1e-9 and t > 1e-12:
                         touch[n_touch] = t
                         n_touch += 1
             for i in range(j):  # where two circles meet
@@ -226,7 +226,7 @@ def _place(cells, owner, circles, base, box, feature, widths, ways):  # type: ig
     """Which cells are too large for a feature near them: 1 split across t, 2 across chi, 3 both, 0 leave.
 
     `feature` (n, f, 2) holds t and chi of each element's features, `widths` (n, f) their half widths. A cell is to be
-    split while it is larger than twice the width and nearer than half its size.
+    split while it is larger than twice the width and nearer than half its size; a feature with t < 0 is everywhere.
     """
     two_pi = 2.0 * math.pi
     for r in range(base.size):
@@ -256,8 +256,8 @@ def _place(cells, owner, circles, base, box, feature, widths, ways):  # type: ig
                 continue
             d_t = max(0.0, max(t0 - t_f, t_f - t1))
             chi = feature[k, f, 1] - two_pi * math.floor((feature[k, f, 1] - 0.5 * (low + high) + math.pi) / two_pi)
-            d_chi = max(0.0, max(low - chi, chi - high)) * min(math.sin(t_f), largest)
-            if math.hypot(d_t, d_chi) <= 0.5 * extent:
+            d_chi = max(0.0, max(low - chi, chi - high)) * min(math.sin(max(t_f, 0.0)), largest)
+            if t_f < 0.0 or math.hypot(d_t, d_chi) <= 0.5 * extent:
                 ways[r] |= 1 if extent_t > 3.0 * extent_chi else (2 if extent_chi > 3.0 * extent_t else 3)
 
 

@@ -18,7 +18,7 @@ from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.fields import Field, FunctionField, Lobes
 from gonio.geometry import angles, unit_vector
 from gonio.integrate import closed_forms
-from gonio.integrate.field_quadrature import integrate_field
+from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.plan import Method, Step, plan
 from gonio.integrate.results import MapValues, insist
@@ -108,7 +108,7 @@ def seen_from(
             else:
                 step.method, step.reason = Method.FIELD, "viewer off axis: quadrature per gradient"
                 elements = placed if step.term.model.isotropic else with_grain(brdf, placed, own)
-                v, e = integrate_field(step.term, step.part, elements, rtol=rtol, atol=atol / len(slow), effort=step.effort)
+                v, e = over_field(step.term, step.part, elements, rtol=rtol, atol=atol / len(slow), effort=step.effort)
             value[seen] += v
             error[seen] += e
             steps.append(step)
