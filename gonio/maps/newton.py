@@ -19,7 +19,7 @@ Model = Callable[[Array], tuple[Array, Array, Array]]
 _MOST_STEPS = 40
 _FINE = 1e-11  # of the range: a step below this ends the search
 _LONGEST = 0.1  # of the range
-_STIFF = 1e10  # damping at which no step helps any more
+_STIFF = 1e8  # damping at which no step helps any more
 _NEGLIGIBLE = 1e-6  # of chi squared
 
 
@@ -65,7 +65,8 @@ def minimise(
         damping[pending] = np.where(
             better, np.maximum(damping[pending] / 30.0, 1e-14), np.maximum(damping[pending], 1e-4) * 10
         )
-        moving = np.any(np.abs(step) > _FINE * span, axis=1) & (damping[pending] < _STIFF)
+        gain = np.sum(step * vector, axis=1)
+        moving = np.any(np.abs(step) > _FINE * span, axis=1) & (damping[pending] < _STIFF) & (gain > 1e-16 + 1e-10 * its_chi)
         pending = pending[moving]
     matrix, vector = normal_equations(slope, weight, target - value)
     step = _damped(matrix, vector, np.full(len(at), 1e-14))

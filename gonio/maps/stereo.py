@@ -182,8 +182,20 @@ class _Found(NamedTuple):
     def none(cls) -> _Found:
         return cls(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
 
+    def with_(self, other: _Found) -> _Found:
+        return _Found(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
     def take(self, index: Index | NDArray[np.bool_]) -> _Found:
         return _Found(self.pixel[index], self.at[index], self.covariance[index], self.chi_squared[index])
+
+
+class _Starts(NamedTuple):
+    """Points to start from, and more of them for blocks that a fold or a kink of the maps divides."""
+
+    pixel: Index
+    at: Array  # (n, 2)
+    more_pixel: Index
+    more: Array
 
 
 class _Maps:
@@ -198,6 +210,7 @@ class _Maps:
         value = np.array([one.value for one in maps])
         half = [np.zeros_like(m.value) if m.band is None else 0.5 * np.abs(m.band[1] - m.band[0]) for m in maps]
         error = np.concatenate(([m.error for m in maps], np.zeros_like(half)))
+        self.width = 2 * count  # functions of the interpolant: the maps, then half their bands
         self.grid = Interpolant(p, q, np.concatenate((value, half)), error)
         self.brightest = np.array([np.max(np.abs(v[np.isfinite(v)]), initial=0.0) for v in value])
         if not np.all(self.brightest > 0):
@@ -209,17 +222,36 @@ class _Maps:
         self.cell = (self.upper - self.lower) / np.array([p.size - 1, q.size - 1])
         self.pyramid = Pyramid(self.grid, count, _REACH * _largest_in_cell(np.array(half)))
 
-    def more_starts(self, pixel: Index, at: Array, half: Array) -> tuple[Index, Array]:
-        """Corners and centres of blocks that a fold or a kink of the maps divides, so that no side of it is left out."""
-        few = np.bincount(pixel, minlength=1)[pixel] <= _FEW
-        pixel, at, half = pixel[few], at[few], half[few]
+    def starts(self, radiance: Array, u: Array) -> tuple[_Starts, NDArray[np.bool_]]:
+        """Where solutions may be, and which pixels may have them almost anywhere.
+
+        A block is dropped if the linear map at its centre, with all that its corners deviate from that, puts the solution
+        outside of it (Krawczyk's test). Blocks that a fold or a kink divides get starts at their corners too.
+        """
+        pixel, at, half, crowded = self.pyramid.starts(radiance, _REACH * u)
+        count = len(self.maps)
         around = np.clip(at + half * _AROUND, self.lower, self.upper)  # (5, n, 2)
-        slope = self.on_grid(around.reshape(-1, 2))[1] / self.brightest[:, None]
-        matrix, _ = normal_equations(slope, np.ones(slope.shape[:2]), np.zeros(slope.shape[:2]))
-        area = np.linalg.det(matrix).reshape(5, -1)
+        value, slope, error = self.grid(*around.reshape(-1, 2).T)
+        value, slope = value.reshape(5, len(at), self.width), slope[:, :count].reshape(5, len(at), count, 2)
+        bands = _REACH * value[0, :, count:]
+        value, error = value[..., :count], error.reshape(5, len(at), self.width)[..., :count]
+        bent = np.abs(value - value[0] - np.einsum("nki,cni->cnk", slope[0], around - at))
+        off = (1.5 * np.max(bent, axis=0) + np.max(error, axis=0) + bands + _REACH * u[pixel]) / self.brightest
+        jacobian = slope / self.brightest[:, None]
+        matrix = np.einsum("cnki,cnkj->cnij", jacobian, jacobian)
+        area = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] ** 2  # (5, n)
+        inverse = covariance(matrix[0])
+        singular = ~np.all(np.isfinite(inverse), axis=(1, 2))
+        inverse[singular] = 0.0
+        pseudo = np.einsum("nij,nkj->nik", inverse, jacobian[0])
+        step = np.einsum("nik,nk->ni", pseudo, (radiance[pixel] - value[0]) / self.brightest)
+        outside = np.abs(step) > 1.05 * half + np.einsum("nik,nk->ni", np.abs(pseudo), off)
+        keep = singular | ~np.any(outside, axis=1)
+        pixel, at, area, around = pixel[keep], at[keep], area[:, keep], around[:, keep]
+        few = np.bincount(pixel, minlength=len(radiance))[pixel] <= _FEW
         least, most = np.min(area, axis=0), np.max(area, axis=0)
-        divided = (most > 0) & ~(least > _DIVIDED * most)
-        return np.tile(pixel[divided], 5), around[:, divided].reshape(-1, 2)
+        divided = few & (most > 0) & ~(least > _DIVIDED * most)
+        return _Starts(pixel, at, np.tile(pixel[divided], 5), around[:, divided].reshape(-1, 2)), crowded
 
     def on_grid(self, at: Array) -> tuple[Array, Array, Array]:
         k = len(self.maps)
@@ -247,27 +279,38 @@ def _solve(scene: _Maps, radiance: Array, u: Array, u_known: bool, confidence: f
 
     allowed = float(chdtri(max(radiance.shape[1] - 2, 1), 1.0 - confidence))
     tolerated = np.hypot(u, (_FLOOR if u_known else _UNKNOWN) * scene.brightest)
-    pixel, at, half, crowded = scene.pyramid.starts(radiance, _REACH * tolerated)
-    extra_pixel, extra = scene.more_starts(pixel, at, half)
-    pixel, at = np.concatenate((pixel, extra_pixel)), np.concatenate((at, extra))
+    starts, many = scene.starts(radiance, tolerated)
+
+    def descend(model: Model, pixel: Index, at: Array) -> tuple[_Found, NDArray[np.bool_]]:
+        at, inside = minimise(model, at, radiance[pixel], tolerated[pixel], scene.lower, scene.upper)
+        return _judged(model, pixel, at, radiance, tolerated), inside
+
+    first, inside = descend(scene.on_grid, starts.pixel, starts.at)
+    flat = first.take(np.isinf(first.covariance[:, 0, 0]) & (first.chi_squared <= allowed))
+    off = (radiance[flat.pixel] - scene.on_grid(flat.at)[0]) / tolerated[flat.pixel]
+    many[flat.pixel[np.sum(off**2, axis=1) <= allowed]] = True  # a solution where maps are flat: more are all around it
+    first, inside = first.take(~many[first.pixel]), inside[~many[first.pixel]]
+    left = ~many[starts.more_pixel]
+    more_pixel, more = starts.more_pixel[left], starts.more[left]
+    second, also_inside = descend(scene.on_grid, more_pixel, more)
+    found, inside = first.with_(second), np.concatenate((inside, also_inside))
     if scene.exact:  # the grid may be a little off at kinks and at its edges; the last word is not its
-        at, _ = minimise(scene.on_grid, at, radiance[pixel], tolerated[pixel], scene.lower, scene.upper)
-        near = _judged(scene.on_grid, pixel, at, radiance, tolerated)
-        near = _distinct(near.take(near.chi_squared <= _GENEROUS * allowed), _APART * scene.cell, 4 * most)
-        pixel, at = np.concatenate((near.pixel, extra_pixel)), np.concatenate((near.at, extra))
-    model, apart = (scene.through_scenes, _APART_EXACT) if scene.exact else (scene.on_grid, _APART)
-    at, inside = minimise(model, at, radiance[pixel], tolerated[pixel], scene.lower, scene.upper)
-    found = _judged(model, pixel[inside], at[inside], radiance, tolerated)
-    found = _distinct(found.take(found.chi_squared <= allowed), apart * scene.cell, most + 1)
+        near = _distinct(found.take(found.chi_squared <= _GENEROUS * allowed), _APART * scene.cell, 4 * most)
+        pixel, at = np.concatenate((near.pixel, more_pixel)), np.concatenate((near.at, more))
+        found, inside = descend(scene.through_scenes, pixel, at)
+    apart = _APART_EXACT if scene.exact else _APART
+    found = _distinct(found.take(inside & (found.chi_squared <= allowed)), apart * scene.cell, most + 1)
     # a solution less certain than the axes are long is none
     spread = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     vague = ~np.all(spread <= scene.upper - scene.lower, axis=1)
-    many = crowded | (np.bincount(found.pixel, minlength=len(radiance)) > most)
+    many |= np.bincount(found.pixel, minlength=len(radiance)) > most
     many[found.pixel[vague]] = True
     found = found.take(~many[found.pixel])
-    if not u_known:
-        of_maps = _judged(model, found.pixel, found.at, radiance, np.zeros_like(tolerated)).covariance
-        found = found._replace(covariance=of_maps if scene.has_band else np.full_like(of_maps, np.nan))
+    if not u_known and scene.has_band:
+        model = scene.through_scenes if scene.exact else scene.on_grid
+        found = _judged(model, found.pixel, found.at, radiance, np.zeros_like(tolerated))
+    elif not u_known:
+        found.covariance[:] = np.nan
     return found, np.flatnonzero(many)
 
 
