@@ -77,9 +77,11 @@ def _step(term: Term, part: Part) -> Step:
     if mirror:
         return Step(term, part, Method.MIRROR, "a mirror: the source seen in the mirror direction")
     if isinstance(part, Field):
-        return Step(term, part, Method.FIELD, "a radiance field: panels between its features, the lobe and the horizon")
+        return Step(term, part, Method.FIELD, "a radiance field: cells between its edges and the surface's horizon")
     if closed_forms.is_lambertian_cap(term, part):
         return Step(term, part, Method.LAMBERT, "a diffuse surface under a uniform sphere or hemisphere")
     if term.model.isotropic and part.axis in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
         return Step(term, part, Method.RADIAL, "symmetric about the view axis: R depends on theta_n only; half the azimuths")
+    if not term.plain:
+        return Step(term, part, Method.GENERAL, "kinks, a grain or a user's function: adaptive cells between known edges")
     return Step(term, part, Method.GENERAL, "only directions above both horizons")
