@@ -28,7 +28,7 @@ from gonio.brdf.base import Model, Parameter
 
 Array = NDArray[np.float64]
 INV_TWO_PI = 0.5 / math.pi
-_SMOOTH = 60.0  # with that exponent the cut at m.w = 0 is below rounding for any rule of the integrator
+_SMOOTH = 40.0  # from that exponent on, what lies next to m.w = 0 is nothing, even where only the tail is lit
 
 
 @jit.model
