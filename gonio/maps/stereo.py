@@ -38,6 +38,8 @@ _GENEROUS = 100.0  # on the grid, where the exact maps have the last word: kinks
 _FEW = 64  # starts of a pixel; one with more has a continuum of solutions
 _AROUND = np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)], dtype=float)[:, None, :]
 _DIVIDED = 0.05  # smallest over largest squared Jacobian over a block
+_KINKED = 3e-3  # of the brightest of a map: an interpolation that may be off by more does not lead to a solution
+_ALIKE = 5.0  # standard uncertainties
 _REACH = 4.0  # standard uncertainties
 
 
@@ -190,12 +192,14 @@ class _Found(NamedTuple):
 
 
 class _Starts(NamedTuple):
-    """Points to start from, and more of them for blocks that a fold or a kink of the maps divides."""
+    """Points to start from on the grid, more of them for divided blocks, and those to start from on the exact maps."""
 
     pixel: Index
     at: Array  # (n, 2)
     more_pixel: Index
     more: Array
+    exact_pixel: Index
+    exact: Array
 
 
 class _Maps:
@@ -251,7 +255,9 @@ class _Maps:
         few = np.bincount(pixel, minlength=len(radiance))[pixel] <= _FEW
         least, most = np.min(area, axis=0), np.max(area, axis=0)
         divided = few & (most > 0) & ~(least > _DIVIDED * most)
-        return _Starts(pixel, at, np.tile(pixel[divided], 5), around[:, divided].reshape(-1, 2)), crowded
+        more_pixel, more = np.tile(pixel[divided], 5), around[:, divided].reshape(-1, 2)
+        kinked = few & ~divided & (most > 0) & np.any(error[0, keep] > _KINKED * self.brightest, axis=1)
+        return _Starts(pixel, at, more_pixel, more, pixel[kinked], at[kinked]), crowded
 
     def on_grid(self, at: Array) -> tuple[Array, Array, Array]:
         k = len(self.maps)
@@ -296,7 +302,9 @@ def _solve(scene: _Maps, radiance: Array, u: Array, u_known: bool, confidence: f
     found, inside = first.with_(second), np.concatenate((inside, also_inside))
     if scene.exact:  # the grid may be a little off at kinks and at its edges; the last word is not its
         near = _distinct(found.take(found.chi_squared <= _GENEROUS * allowed), _APART * scene.cell, 4 * most)
-        pixel, at = np.concatenate((near.pixel, more_pixel)), np.concatenate((near.at, more))
+        pixel = np.concatenate((near.pixel, more_pixel, starts.exact_pixel))
+        at = np.concatenate((near.at, more, starts.exact))
+        pixel, at = pixel[~many[pixel]], at[~many[pixel]]
         found, inside = descend(scene.through_scenes, pixel, at)
     apart = _APART_EXACT if scene.exact else _APART
     found = _distinct(found.take(inside & (found.chi_squared <= allowed)), apart * scene.cell, most + 1)
@@ -323,7 +331,11 @@ def _judged(model: Model, pixel: Index, at: Array, radiance: Array, u: Array) ->
 
 
 def _distinct(found: _Found, apart: Array, most: int) -> _Found:
-    """The best of each group of candidates nearer to each other than `apart` (2,); at most `most` a pixel."""
+    """The best of each group of candidates; at most `most` a pixel.
+
+    A group lies within `apart` (2,) of its best, or within its uncertainty and fits worse: on a kink of the maps a search
+    may end beside the minimum.
+    """
     found = found.take(np.lexsort((found.chi_squared, found.pixel)))
     kept: list[Index] = []
     rest = np.arange(len(found.pixel))
@@ -334,8 +346,11 @@ def _distinct(found: _Found, apart: Array, most: int) -> _Found:
         best = rest[first]
         kept.append(best)
         leader = best[np.cumsum(first) - 1]
-        others = np.any(np.abs(found.at[rest] - found.at[leader]) > apart, axis=1)
-        rest = rest[others]
+        off = found.at[rest] - found.at[leader]
+        worse = found.chi_squared[rest] > found.chi_squared[leader] + 1e-3
+        spread = _ALIKE * np.sqrt(np.diagonal(found.covariance[leader], axis1=1, axis2=2))
+        alike = np.all(np.abs(off) <= apart, axis=1) | (worse & np.all(np.abs(off) <= spread, axis=1))
+        rest = rest[~alike]
     return found.take(np.sort(np.concatenate(kept)) if kept else rest)
 
 
