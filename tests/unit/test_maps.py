@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import doctest
+import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import gonio
+from gonio.cli.map import map_
 from gonio.errors import DatasetError, GeometryError, ParameterError
 from gonio.maps import ReflectanceMap, compute, gradients_of_heights, gradients_of_normals
 from gonio.maps.images import read_heights, write_image
@@ -257,6 +261,44 @@ def test_heights_and_images_in_files(tmp_path: Path, suffix: str, accuracy: floa
         read_heights(tmp_path / "line.npy")
     with pytest.raises(DatasetError, match="png"):
         write_image(tmp_path / "z.png", z)
+
+
+def test_gonio_map_renders_heights(lit: ReflectanceMap, tmp_path: Path) -> None:
+    scene = f"""[brdf]
+model = "lambertian"
+lambertian.albedo = {ALBEDO}
+[[source]]
+kind = "collimated"
+theta_deg = {math.degrees(THETA)}
+phi_deg = {math.degrees(PHI)}
+irradiance = {math.pi}
+[grid]
+n = 9
+"""
+    (tmp_path / "scene.toml").write_text(scene)
+    z = hemisphere(21)[1]
+    for suffix, accuracy in ((".npy", 1e-12), (".tiff", 2e-5)):  # 32-bit heights have differences of 24 bits less a few
+        write_image(tmp_path / f"z{suffix}", z)
+        command = [
+            str(tmp_path / "scene.toml"),
+            "--out",
+            str(tmp_path / "ball.nc"),
+            "--render",
+            str(tmp_path / f"z{suffix}"),
+        ]
+        told = CliRunner().invoke(map_, [*command, "--spacing", "0.06,-0.06", "--json"])
+        assert told.exit_code == 0 and json.loads(told.stdout)["pixels_without_surface"] == 0
+        image = read_heights(tmp_path / f"ball_image{suffix}")
+        assert image == pytest.approx(lit.render_heights(z, (0.06, -0.06)).value, abs=accuracy)
+        for spacing in ([], ["--spacing", "wide"], ["--spacing", "1,2,3"]):
+            refused = CliRunner().invoke(map_, [*command, *spacing]).exception
+            assert isinstance(refused, ParameterError) and "--spacing" in str(refused)
+
+
+def test_the_page_on_photometric_stereo_prints_what_it_says() -> None:
+    page = Path(__file__).parents[2] / "docs" / "photometric-stereo.md"
+    failed, tried = doctest.testfile(str(page), module_relative=False, verbose=False)
+    assert failed == 0 and tried > 15
 
 
 # --- computing ----------------------------------------------------------------------------------------------------------
