@@ -2,9 +2,9 @@
 
 The camera looks at one spot of the sphere at a time, so small that the normal is the same in all of it. Mitsuba's models
 are not gonio's (its rough conductor has another shadowing term, its rough plastic another diffuse part), so only the
-diffuse surface can be compared by error. It computes in single precision. It is not among gonio's dependencies: ``pip
-install -e '.[bench]'`` brings it; without it this peer is left out, and says so. It renders in a process of its own, which its
-LLVM variant may take down with it; then the scalar one has its turn.
+diffuse surface can be compared by error. It computes in single precision. It is not among gonio's dependencies; ``pip
+install -e '.[bench]'`` brings it, and without it this peer is left out and says so. It renders in a process of its own,
+which its LLVM variant may take down with it; then the scalar one has its turn.
 """
 
 from __future__ import annotations
