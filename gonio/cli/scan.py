@@ -105,7 +105,7 @@ def measure(run: Run, output: Output) -> None:
 @contextlib.contextmanager
 def _stages(output: Output) -> Iterator[Callable[[str, int, int], None]]:
     """One bar at a time: a new stage closes the one before."""
-    names = {"dark": "dark frames", "white": "white reference", "poses": "scan"}
+    names = {"home": "home axes", "dark": "dark frames", "white": "white reference", "poses": "scan"}
     with contextlib.ExitStack() as stack:
         opened: dict[str, Callable[[int, int], None]] = {}
 

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 _SPARE_BYTES = 50_000_000
 
 Progress = Callable[[str, int, int], None]
-"""Called with a stage (``"dark"``, ``"white"``, ``"poses"``), how much of it is done, and how much there is."""
+"""Called with a stage (``"home"``, ``"dark"``, ``"white"``, ``"poses"``), how much of it is done, and how much there is."""
 
 
 class ScanRig(Protocol):
@@ -148,6 +148,7 @@ class _Scan:
         self._check_space(len(todo))
         try:
             self._begin(resumed=bool(done))
+            self._home()
             self._darks()
             self._rig.lamp.set_level(self._config.lamp.level)
             self._rig.lamp.set_output(True)
@@ -186,6 +187,19 @@ class _Scan:
             }
         )
 
+    def _home(self) -> None:
+        """All axes to the reference geometry: each is seen to move and to arrive before anything is measured.
+
+        The encoders are absolute, so no switch is searched for.
+        """
+        self._progress("home", 0, 1)
+        self._motion.move(self._reference())
+        self._progress("home", 1, 1)
+
+    def _reference(self) -> dict[str, float]:
+        """Joint angles of the white reference's geometry [rad]."""
+        return {axis: float(getattr(self._config.white, axis)) for axis in AXES}
+
     def _darks(self) -> None:
         """Frames with the lamp off, for each exposure that has none yet."""
         taken = {block.number for block in self._run.blocks("dark")}
@@ -218,10 +232,9 @@ class _Scan:
         """One block of the white reference; the sample is back on the stage after it."""
         number = len(self._run.blocks("white"))
         repeats = self._plan_config.white_repeats or self._config.white.repeats
-        goal = {axis: float(getattr(self._config.white, axis)) for axis in AXES}
         self._rig.mount("white")
         for _ in range(ATTEMPTS):
-            before = self._motion.move(goal)
+            before = self._motion.move(self._reference())
             brackets: list[list[Frame]] = []
             times_s: list[float] = []
             for repeat in range(repeats):
