@@ -36,6 +36,8 @@ EPS = float(np.finfo(float).eps)
 _BLOCK = 64  # elements that advance together
 _CHUNK = 1024  # cells evaluated at once: 30 MiB
 _LARGEST = 1 << 24  # nodes for one element
+_SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of the rules
+_GROWTH = 8.0  # of panels away from the horizon
 _DEEPEST = 2.0**-40  # of a base cell's side
 _RULES = np.stack((KRONROD, GAUSS), axis=1)
 
@@ -309,7 +311,7 @@ class _Block:
                     f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
                 )
             best = sums[:, 0, 0]
-            out[:, part] = best, np.abs(best - sums[:, 1, 0]), np.abs(best - sums[:, 0, 1])
+            out[:, part] = best, _SAFETY * np.abs(best - sums[:, 1, 0]), _SAFETY * np.abs(best - sums[:, 0, 1])
             self.effort.add(f_r.size, side)
         return out[0], out[1], out[2]
 
@@ -329,6 +331,9 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
         if len(kinks) > MOST_PLANES:
             raise ParameterError(f"{term.model.name}: {len(kinks)} planes of kinks; at most {MOST_PLANES} can be broken at")
         own.append(np.column_stack((kinks[:, :3], np.arccos(kinks[:, 3]))).tolist())
+        # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
+        layer = max(1e-9, min(float(fixed[k, 2]), term.lobe_width() or 1.0))
+        own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
         if light is not None and light.planes is not None:
             own.append(light.planes[k].tolist())
         rows.append(np.array([row for group in own for row in group]).reshape(-1, 4))

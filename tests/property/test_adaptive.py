@@ -228,7 +228,7 @@ def test_a_tolerance_out_of_reach_says_what_was_reached(monkeypatch: pytest.Monk
         gonio.reflectance_map(rough, SOURCES["uniform"], 0.0, 0.0, rtol=1e-9)
     best = caught.value.best
     assert isinstance(best, MapValues) and not best.error_is_bound
-    assert abs(float(best.value) - 1.5 * math.pi) <= float(best.error) < 0.1
+    assert abs(float(best.value) - 1.5 * math.pi) <= float(best.error) < 0.5
 
 
 def test_nan_between_the_probes_is_told() -> None:
