@@ -30,6 +30,7 @@ SHOWN = (  # scenes on which scipy has its turn, and which the picture shows
     Scene("lambert", "sky"), Scene("ggx 0.1", "sky"), Scene("ggx 0.02", "sky"), Scene("oren_nayar", "sky"),
     Scene("lambert", "vmf"), Scene("phong 50", "vmf"), Scene("ggx 0.1", "vmf"), Scene("ggx 0.02", "vmf"),
     Scene("ggx 0.1", "disk 5"), Scene("ggx 0.02", "disk 5"), Scene("ggx 0.02", "disk 0.25"), Scene("ggx 0.1", "map"),
+    Scene("lambert", "sphere"), Scene("lambert", "map"), Scene("ggx 0.02", "map"), Scene("ggx 0.3", "vmf"),
 )  # fmt: skip
 QUICK = (Scene("lambert", "sky"), Scene("ggx 0.1", "sky"), Scene("ggx 0.02", "vmf"), Scene("ggx 0.1", "disk 5"))
 
@@ -106,7 +107,7 @@ def measure(*, quick: bool, chosen: str = "") -> Iterator[Result]:
             result.runs.append(_by_formula(scene, true))
         else:
             result.runs += _product_rules(scene, true, 0.1 if quick else 0.4)
-            result.runs += _scipy(scene, true, 1.0 if quick or scene not in SHOWN else 3.0, whole=scene in SHOWN)
+            result.runs += _scipy(scene, true, 1.0 if quick or scene not in SHOWN else 2.0, whole=scene in SHOWN)
             if scene.surface == "lambert" and scene.light in ("sphere", "map"):
                 for setting, seconds, error, samples in mitsuba_peer.measure(scene, true):
                     result.runs.append(Run("mitsuba", setting, seconds / CORES, error, samples))

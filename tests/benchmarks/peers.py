@@ -186,7 +186,7 @@ def midpoint(n: int) -> tuple[Array, Array, Array, Array]:
 def gauss(n: int) -> tuple[Array, Array, Array, Array]:
     """Gauss-Legendre in theta, trapezoid in phi, n x 2n nodes."""
     x, w = np.polynomial.legendre.leggauss(n)
-    return _product((x + 1.0) * (np.pi / 4), w * (np.pi / 4), 2 * n)
+    return _product(np.asarray((x + 1.0) * (np.pi / 4)), np.asarray(w * (np.pi / 4)), 2 * n)
 
 
 def _product(theta: Array, w: Array, columns: int) -> tuple[Array, Array, Array, Array]:
