@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from gonio.brdf.base import BRDF
 from gonio.errors import GeometryError, ParameterError
 from gonio.fields import Field
-from gonio.geometry import normal_from_gradient
-from gonio.integrate import closed_forms, radial, viewpoint
+from gonio.integrate import closed_forms, viewpoint
 from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
-from gonio.integrate.plan import Method, Step, plan
+from gonio.integrate.grid import Gradients
+from gonio.integrate.methods import Run
+from gonio.integrate.plan import Method, plan
 from gonio.integrate.quadrature import integrate_cap
 from gonio.integrate.results import Estimate, MapValues, insist
 from gonio.source import Collimated, Source, uniform
@@ -33,7 +34,6 @@ from gonio.source import Collimated, Source, uniform
 __all__ = ["Estimate", "MapValues", "directional_albedo", "plan", "reflectance_map", "scene_radiance"]
 
 Array = NDArray[np.float64]
-_FEW = 64  # distinct slopes below which a table in theta_n does not pay
 
 
 def reflectance_map(
@@ -46,6 +46,7 @@ def reflectance_map(
     *,
     tangent: ArrayLike | None = None,
     viewer: tuple[float, float] | None = None,
+    threads: int | None = None,
 ) -> MapValues:
     r"""Reflectance map R(p, q): scene radiance as a function of the surface gradient.
 
@@ -64,6 +65,8 @@ def reflectance_map(
     viewer : (theta, phi), optional
         Direction of a distant viewer off the z axis [rad], in the coordinates of source and gradients; R is 0 where the
         surface faces away. Fields then cost a quadrature per gradient.
+    threads : int, optional
+        All cores by default. The result does not depend on it.
 
     Returns
     -------
@@ -90,72 +93,29 @@ def reflectance_map(
     """
     if not (math.isfinite(rtol) and rtol > 0 and math.isfinite(atol) and atol >= 0):
         raise ParameterError(f"rtol = {rtol:g} and atol = {atol:g}: rtol must be positive, atol zero or positive")
-    p, q = np.broadcast_arrays(np.asarray(p, dtype=float), np.asarray(q, dtype=float))
     if tangent is not None:
-        p, q, tangent = np.broadcast_arrays(p, q, np.asarray(tangent, dtype=float))
+        p, q, tangent = (np.asarray(a, dtype=float) for a in np.broadcast_arrays(p, q, tangent))
     if viewer is not None:
+        p, q = (np.asarray(a, dtype=float) for a in np.broadcast_arrays(p, q))
         return viewpoint.seen_from(viewer, brdf, source, p, q, rtol, atol, tangent)
-    elements = Elements.from_gradient(p.ravel(), q.ravel())
-    grained = viewpoint.with_grain(brdf, elements, None if tangent is None else np.ravel(tangent))
-    theta_n = normal_from_gradient(p.ravel(), q.ravel())[0]
-    value, error = np.zeros(len(elements)), np.zeros(len(elements))
+    gradients = Gradients(p, q)
+    if tangent is not None or not all(term.model.isotropic for term in brdf.terms):
+        viewpoint.with_grain(brdf, gradients.elements(0, 0), None if tangent is None else np.empty(0))  # may complain
+    value, error = np.zeros(gradients.size), np.zeros(gradients.size)
     impulses: list[tuple[float, float, float]] = []
     steps = plan(brdf, Source.of(source))
-    share = 1.0 / max(1, len(steps))
+    run = Run(gradients, None if tangent is None else np.ravel(tangent), rtol, atol / max(1, len(steps)), threads)
     for step in steps:
         start = time.perf_counter()
         if step.method is Method.IMPULSE:
             assert isinstance(step.part, Collimated)
             impulses += closed_forms.mirror_beam(step.term, step.part)
-            continue
-        own = elements if step.term.model.isotropic else grained
-        v, e = _run(step, own, theta_n, rtol, atol * share)
-        value += v
-        error += e
+        elif step.method is not Method.ZERO:
+            step.error = run.add(step, value, error)
         step.seconds = time.perf_counter() - start
-        step.error = float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
     bound = not viewpoint.depends_on_user(brdf, Source.of(source))
-    result = MapValues(value.reshape(p.shape), error.reshape(p.shape), impulses, steps, error_is_bound=bound)
+    result = MapValues(value.reshape(gradients.shape), error.reshape(gradients.shape), impulses, steps, error_is_bound=bound)
     return insist(result, rtol, atol)
-
-
-def _run(step: Step, elements: Elements, theta_n: Array, rtol: float, atol: float) -> tuple[Array, Array]:
-    """Value and error of one step for all elements."""
-    term, part = step.term, step.part
-    if step.method is Method.ZERO:
-        return np.zeros(len(elements)), np.zeros(len(elements))
-    if isinstance(part, Collimated):
-        step.effort.add(len(elements), 1)
-        return closed_forms.collimated(term, part, elements)
-    if step.method is Method.MIRROR:
-        return closed_forms.mirror_cap(term, part, elements)
-    if isinstance(part, Field):
-        return over_field(term, part, elements, rtol=rtol, atol=atol, effort=step.effort)
-    if step.method is Method.LAMBERT:
-        return closed_forms.lambertian_cap(term, part, elements)
-    if step.method is Method.RADIAL:
-        slopes, where = np.unique(theta_n, return_inverse=True)
-        if len(slopes) > _FEW:
-            table = radial.tabulate(
-                lambda t: integrate_cap(
-                    term,
-                    part,
-                    Elements.from_polar(t, 0.0),
-                    rtol=0.25 * rtol,
-                    atol=0.25 * atol,
-                    about_normal=None,
-                    effort=step.effort,
-                ),
-                float(slopes[-1]),
-                rtol=rtol,
-                atol=atol,
-            )
-            return table(theta_n)
-        first = np.zeros(len(slopes), dtype=np.intp)
-        first[where[::-1]] = np.arange(len(theta_n))[::-1]
-        v, e = integrate_cap(term, part, elements.select(first), rtol=rtol, atol=atol, about_normal=None, effort=step.effort)
-        return v[where], e[where]
-    return integrate_cap(term, part, elements, rtol=rtol, atol=atol, about_normal=None, effort=step.effort)
 
 
 def scene_radiance(

@@ -1,29 +1,42 @@
 """One (term, cap) integral for each of many surface elements, by the rule of `gonio.integrate.cap`, order by order.
 
-The error of a value is judged by how it differs from the two lower orders, plus the rounding of the sum. While the rule
-converges the last difference is the error of the lower order, far above that of the value; where the differences do not
-fall (an integrand with jumps or kinks), both count, twice.
+Elements advance together: those that miss the tolerance at one order go on to the next. The error of a value is judged by
+how it differs from lower orders, plus the rounding of the sum. While the rule converges the last difference is the
+error of the lower order, far above that of the value; where the differences do not fall (an integrand with jumps or kinks
+that nobody declared), the largest of them counts. No element starts at an order too low to resolve its narrowest feature.
 """
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gonio import jit
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
+from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import over_cap
-from gonio.integrate.cap import ORDERS, cap_nodes, unit_rule
+from gonio.integrate.cap import NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.source import Cap
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
+ORDERS = (8, 13, 19, 27, 38, 54, 76, 100)  # nodes per panel
+_FROM = ((1e-5, 0), (3e-9, 1), (1e-11, 2), (0.0, 3))  # rtol at least this: start with that order
+_PER_WIDTH, _PER_LAYER = 1.3, 2.0  # nodes per unit of the sinh maps of lobe and horizon that the first order must have
 _NO_LOBE = 1e9  # [rad]
-_LARGEST = 1 << 24  # nodes for one surface element: 512 MiB
+_LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
+_TILE = 1 << 15  # nodes evaluated at once: they stay in the cache
+_LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
+_NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
+_BROAD = 0.5  # lobe width [rad] from which a lobe does not matter for that choice
 
 
 @dataclass
@@ -38,47 +51,51 @@ class Effort:
         self.order = max(self.order, order)
 
 
-class _Frame(NamedTuple):
-    """First arguments of `cap_nodes`."""
+class _Scene(NamedTuple):
+    """What the tiles of one integral share; arrays over the elements."""
 
-    cos_n: float
-    sin_n: float
+    term: Term
+    cap: Cap
+    cos_n: Array
+    sin_n: Array
     axis: Array
-    half_angle: float
-    about_normal: bool
+    about_normal: NDArray[np.bool_]
     width: float
-    symmetric: bool
-
-
-class _Scratch:
-    """Node arrays that grow to what the largest element needs."""
-
-    def __init__(self) -> None:
-        self.resize(1 << 14)
-
-    def resize(self, size: int) -> None:
-        self.directions, self.weights = np.empty((size, 3)), np.empty(size)
-        self.viewer, self.f_r = np.empty((size, 3)), np.empty(size)
+    planes: Array
+    symmetric: NDArray[np.bool_]
 
 
 def integrate_cap(
-    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool | None, effort: Effort
+    term: Term,
+    cap: Cap,
+    elements: Elements,
+    *,
+    rtol: float,
+    atol: float,
+    about_normal: bool | None,
+    effort: Effort,
+    threads: int = 1,
+    cautious: bool = True,
 ) -> tuple[Array, Array]:
     """Reflected radiance of each element due to one term and one cap.
 
     Parameters
     ----------
     term : Term
-        With values (no delta). One that is not plain goes to `gonio.integrate.adaptive`.
+        With values (no delta). Anisotropic ones and functions of the user's go to `gonio.integrate.adaptive`.
     cap : Cap
     elements : Elements, length n
     rtol, atol : float
         Tolerance per element. An element that does not reach it keeps its honest error.
     about_normal : bool or None
         Pole of the coordinates: the surface normal (the memo's local form) or the cap's axis (its viewer form, when the
-        axis is the viewer's). None: the normal for wide caps, the axis for narrow ones.
+        axis is the viewer's). None: whichever suits each element.
     effort : Effort
         Added to.
+    threads : int, optional
+    cautious : bool, optional
+        Refine until the estimate is a quarter of the tolerance and report at least half of the tolerance: differences of
+        sums are sometimes small by chance. False: bare estimates, for callers with checks of their own.
 
     Returns
     -------
@@ -90,54 +107,175 @@ def integrate_cap(
     IntegrationError
         If an element would need more than 16 million nodes.
     """
-    local = about_normal if about_normal is not None else cap.half_angle > 0.5
-    if not term.plain:
-        return over_cap(term, cap, elements, rtol=rtol, atol=atol, about_normal=local, effort=effort)
-    width = term.lobe_width()
-    axis_local = elements.local(cap.axis)
-    value, error = np.zeros(len(elements)), np.zeros(len(elements))
-    scratch = _Scratch()
-    for k in range(len(elements)):
-        axis = np.ascontiguousarray(axis_local[k])
-        if cap.half_angle < np.pi / 2 and axis[2] <= -np.sin(cap.half_angle):
-            continue  # the whole cap is below the horizon of this element
-        symmetric = bool(axis[1] == 0.0) and term.model.isotropic
-        cosine, sine = float(elements.cos_theta[k]), float(elements.sin_theta[k])
-        frame = _Frame(cosine, sine, axis, cap.half_angle, local, width or _NO_LOBE, symmetric)
-        totals: list[float] = []
-        for order in ORDERS:
-            total, nodes = _sum(term, cap, frame, order, scratch)
-            effort.add(nodes, order)
-            totals.append(total)
-            rounding = 4.0 * EPS * abs(total) * (1.0 + 1.0 / frame.width)
-            value[k], error[k] = total, _estimate(totals) + rounding
-            if error[k] <= max(rtol * abs(total), atol):
-                break
+    model = term.model
+    if model.function is None or model.own or not model.isotropic:
+        local = cap.half_angle > _NARROW if about_normal is None else about_normal
+        return over_cap(term, cap, elements, rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort)
+    scene = _scene(term, cap, elements, about_normal)
+    n = len(elements)
+    value, error = np.zeros(n), np.zeros(n)
+    lit = np.ones(n, dtype=np.bool_)
+    if cap.half_angle < math.pi / 2:  # else the whole cap may be below the horizon of an element
+        lit = scene.axis[:, 2] > -math.sin(cap.half_angle)
+    unit = _rounding(scene)
+    first = _first_orders(scene, rtol)
+    done = ~lit
+    totals = np.full((5, n), np.nan)  # of the last orders, newest first
+    kinked = scene.planes.shape[1] > 0
+    for k, order in enumerate(ORDERS[:-3] if kinked else ORDERS):
+        active = np.flatnonzero(~done & (first <= k))
+        if not active.size:
+            continue
+        now, nodes = _sums(scene, active, order, threads)
+        effort.add(nodes, order)
+        totals[1:, active] = totals[:-1, active]
+        totals[0, active] = now
+        value[active] = now
+        allowed = np.maximum(rtol * np.abs(now), atol)
+        estimate, rounding = _estimate(totals[:, active]), unit[active] * np.abs(now)
+        done[active] = estimate + rounding <= (0.25 if cautious else 1.0) * allowed
+        error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
+        if np.all(done):
+            break
+    rest = np.flatnonzero(~done)
+    if kinked and rest.size:  # edges that cross
+        value[rest], error[rest] = over_cap(
+            term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=True, effort=effort
+        )
     return value, error
 
 
-def _estimate(totals: list[float]) -> float:
-    """Error of the last of a series of results of rising order."""
-    if len(totals) == 1:
-        return float("inf")
-    last = abs(totals[-1] - totals[-2])
-    if len(totals) == 2:
-        return 2.0 * last
-    before = abs(totals[-2] - totals[-3])
-    return max(last, 0.03 * before) if last < 0.1 * before else 2.0 * max(last, before)
+def _scene(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) -> _Scene:
+    axis = np.ascontiguousarray(elements.local(cap.axis))
+    n, width = len(elements), term.lobe_width() or _NO_LOBE
+    if term.model.kinks is None:
+        planes = np.empty((n, 0, 4))
+    else:
+        each = [term.kinks(viewer) for viewer in elements.viewer()]
+        planes = np.full((n, max((len(p) for p in each), default=0), 4), (0.0, 0.0, 1.0, 2.0))  # a plane out of reach
+        for k, rows in enumerate(each):
+            planes[k, : len(rows)] = rows
+    if about_normal is not None:
+        local = np.full(n, about_normal)
+    elif cap.half_angle >= math.pi or planes.shape[1]:
+        local = np.ones(n, dtype=np.bool_)
+    elif width > _BROAD:
+        local = np.full(n, cap.half_angle > _NARROW)
+    else:  # a rim through the lobe is smooth about the cap's axis; a grazing view's lobe, a streak, only about the normal
+        mirror = np.arccos(np.clip(elements.sin_theta * axis[:, 0] + elements.cos_theta * axis[:, 2], -1.0, 1.0))
+        inside = (cap.half_angle - mirror) / width
+        least = -3.0 if cap.half_angle > _NARROW else -10.0 if cap.half_angle > 0.5 * _NARROW else -np.inf
+        local = (inside > 10.0) | (inside < least) | (elements.cos_theta < 0.2)
+    symmetric = (axis[:, 1] == 0.0) & term.model.isotropic & (not term.model.own)
+    cos_n = np.maximum(elements.cos_theta, _LIMB)
+    return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, planes, symmetric)
 
 
-def _sum(term: Term, cap: Cap, frame: _Frame, order: int, scratch: _Scratch) -> tuple[float, int]:
+def _rounding(scene: _Scene) -> Array:
+    """Relative rounding error of the sums: 1 eps of a direction is eps / width of a lobe, or of what a horizon leaves."""
+    width = scene.width * np.maximum(scene.cos_n, min(scene.width, 1.0))
+    rounding = 4.0 * EPS * (1.0 + 1.0 / width)
+    if scene.cap.half_angle < math.pi / 2:
+        sine = math.sin(scene.cap.half_angle)
+        height = np.minimum(np.abs(scene.axis[:, 2] + sine), sine)
+        rounding += 4.0 * EPS * (1.0 / np.maximum(height, EPS) + 1.0 / sine)
+    return rounding
+
+
+def _first_orders(scene: _Scene, rtol: float) -> NDArray[np.intp]:
+    """Index of the order to start with: by the tolerance, and such that no feature falls between the nodes."""
+    start = next(k for least, k in _FROM if rtol >= least)
+    if scene.width >= 10.0:
+        return np.full(len(scene.cos_n), start)
+    layer = _PER_LAYER * np.arcsinh(1.0 / np.maximum(scene.cos_n, 1e-15))
+    needed = np.maximum(_PER_WIDTH * math.asinh(1.0 / scene.width), layer)
+    return np.maximum(start, np.minimum(np.searchsorted(ORDERS, needed), len(ORDERS) - 3))
+
+
+def _estimate(totals: Array) -> Array:
+    """Error of the newest of a series of results of rising order, shape (k, n), newest first, NaN before the first."""
+    steps = np.abs(np.diff(totals, axis=0))
+    step, earlier, third = steps[:3]
+    largest = np.max(np.nan_to_num(steps), axis=0)
+    converging = (step < 0.1 * earlier) & (np.isnan(third) | (earlier < 0.5 * third))
+    slow = np.maximum(np.maximum(step, earlier), 0.5 * largest)
+    three = np.where(converging, np.maximum(step, 0.005 * earlier), slow)
+    return np.where(np.isnan(step), np.inf, np.where(np.isnan(earlier), 2.0 * step, three))
+
+
+def _sums(scene: _Scene, active: NDArray[np.intp], order: int, threads: int) -> tuple[Array, int]:
+    """Sums of one order for the elements of index `active`, and how many nodes they took."""
+    size = max(1, _TILE // (3 * order * order))
+    out = np.empty(active.size)
+    work = functools.partial(_tile, scene, active, out, order, size)
+    return out, sum(tiling.run(work, range(0, active.size, size), threads))
+
+
+def _tile(scene: _Scene, active: NDArray[np.intp], out: Array, order: int, size: int, at: int) -> int:
     x, w = unit_rule(order)
-    while (n := cap_nodes(*frame, x, w, scratch.directions, scratch.weights)) < 0:
-        if scratch.weights.size >= _LARGEST:
-            raise IntegrationError(f"{term.model.name} under {cap.kind}: more than {_LARGEST} nodes for one gradient")
-        scratch.resize(2 * scratch.weights.size)
-    directions, weights = scratch.directions[:n], scratch.weights[:n]
-    viewer, f_r = scratch.viewer[:n], scratch.f_r[:n]
-    viewer[:] = (-frame.sin_n, 0.0, frame.cos_n)
-    f_r[:] = 0.0
-    accumulate(term.model)(directions, viewer, term.values, term.weight, f_r)
-    if cap.profile is not None:
-        f_r *= cap.profile(directions @ frame.axis)
-    return cap.radiance * float(np.dot(weights, f_r)), n
+    index = active[at : at + size]
+    cos_n, sin_n, axis, planes = scene.cos_n[index], scene.sin_n[index], scene.axis[index], scene.planes[index]
+    local, symmetric = scene.about_normal[index], scene.symmetric[index]
+    nodes = tiling.scratch("nodes", lambda: np.empty((NODE_ROWS, 2 * _TILE)))
+    starts = np.zeros(index.size + 1, dtype=np.int64)
+    done = total = 0
+    while done < index.size:
+        rest = slice(done, None)
+        m = ring_nodes(
+            cos_n[rest], sin_n[rest], axis[rest], scene.cap.half_angle, local[rest], scene.width, planes[rest],
+            symmetric[rest], x, w, nodes, starts,
+        )  # fmt: skip
+        if m == 0:  # one element alone needs more
+            if nodes.shape[1] >= _LARGEST:
+                raise IntegrationError(
+                    f"{scene.term.model.name} under {scene.cap.kind}: more than {_LARGEST} nodes for one gradient"
+                )
+            nodes = np.empty((NODE_ROWS, 4 * nodes.shape[1]))
+            continue
+        some = slice(done, done + m)
+        count = int(starts[m])
+        if scene.cap.profile is not None:
+            nodes[3, :count] *= scene.cap.profile(nodes[4, :count])
+        sums = weighted_sums(scene.term)(nodes, starts[: m + 1], cos_n[some], sin_n[some])
+        out[at + done : at + done + m] = scene.cap.radiance * sums
+        total += count
+        done += m
+    return total
+
+
+def weighted_sums(term: Term) -> Callable[[Array, NDArray[np.int64], Array, Array], Array]:
+    """``f(nodes, starts (m + 1,), cos_n (m,), sin_n (m,)) -> (m,)``: weight * f_r summed over the nodes of each element."""
+    if term.model.function is None:
+        return functools.partial(_array_sums, term)
+
+    def sums(nodes: Array, starts: NDArray[np.int64], cos_n: Array, sin_n: Array) -> Array:
+        out = np.empty(len(cos_n))
+        _compiled_sums(term.model.function)(
+            nodes[0], nodes[1], nodes[2], nodes[3], starts, cos_n, sin_n, term.values, term.weight, out
+        )
+        return out
+
+    return sums
+
+
+@functools.cache
+def _compiled_sums(function: Any) -> Any:
+    def sum_nodes(x, y, z, weights, starts, cos_n, sin_n, p, weight, out):  # type: ignore[no-untyped-def]
+        for k in range(out.size):
+            total = 0.0
+            xr, zr = -sin_n[k], cos_n[k]
+            for j in range(starts[k], starts[k + 1]):
+                total += weights[j] * function(x[j], y[j], z[j], xr, 0.0, zr, p)
+            out[k] = weight * total
+
+    return jit.kernel(sum_nodes)
+
+
+def _array_sums(term: Term, nodes: Array, starts: NDArray[np.int64], cos_n: Array, sin_n: Array) -> Array:
+    count = int(starts[-1])
+    length = np.diff(starts)
+    viewer = np.repeat(np.stack((-sin_n, np.zeros_like(sin_n), cos_n), axis=-1), length, axis=0)
+    f_r = np.zeros(count)
+    accumulate(term.model)(np.ascontiguousarray(nodes[:3, :count].T), viewer, term.values, term.weight, f_r)
+    running = np.concatenate(([0.0], np.cumsum(nodes[3, :count] * f_r)))
+    return np.asarray(running[starts[1:]] - running[starts[:-1]])

@@ -1,0 +1,107 @@
+"""How each method of a plan is carried out on a list of gradients, tile by tile where it can be."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.fields import Field
+from gonio.integrate import closed_forms, radial
+from gonio.integrate import threads as tiling
+from gonio.integrate.adaptive import over_field
+from gonio.integrate.frames import Elements
+from gonio.integrate.grid import Gradients, add_beam, add_diffuse
+from gonio.integrate.plan import Method, Step
+from gonio.integrate.quadrature import integrate_cap
+from gonio.source import Cap, Collimated
+
+Array = NDArray[np.float64]
+_FEW = 64  # gradients up to which a table in theta_n does not pay
+_SAMPLE = 0.125  # of the tolerance: that of a table's samples
+
+
+@dataclass
+class Run:
+    """One map: gradients and tolerances.
+
+    Attributes
+    ----------
+    gradients : Gradients
+    tangent : ndarray, shape (n,), optional
+        For anisotropic surfaces [rad].
+    rtol, atol : float
+        Tolerance of each step.
+    threads : int, optional
+        None: all cores.
+    """
+
+    gradients: Gradients
+    tangent: Array | None
+    rtol: float
+    atol: float
+    threads: int | None
+
+    def add(self, step: Step, value: Array, error: Array) -> float:
+        """Add one step's value and error (n,); returns its largest relative error."""
+        count = tiling.available() if self.threads is None else self.threads
+        by_tile = self._by_tile(step, count)
+        if by_tile is not None:
+            return max(tiling.run(lambda tile: by_tile(tile, value, error), self.gradients.tiles(), count), default=0.0)
+        elements = self.gradients.elements()
+        if not step.term.model.isotropic and self.tangent is not None:
+            elements = elements.turned(self.tangent)
+        v, e = self._by_element(step, elements, count)
+        value += v
+        error += e
+        return float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
+
+    def _by_tile(self, step: Step, threads: int) -> Callable[[tuple[int, int], Array, Array], float] | None:
+        term, part, grid = step.term, step.part, self.gradients
+        if isinstance(part, Collimated) and term.model.function is not None and term.model.isotropic:
+            step.effort.add(grid.size, 1)
+            return lambda tile, value, error: add_beam(term, part, grid, tile, value, error)
+        if not isinstance(part, Cap):
+            return None
+        if step.method is Method.LAMBERT:
+            return lambda tile, value, error: add_diffuse(term, part, grid, tile, value, error)
+        if step.method is Method.RADIAL and grid.size > _FEW:
+            table = self._table(step, part, threads)
+            return functools.partial(table.add, grid)
+        return None
+
+    def _by_element(self, step: Step, elements: Elements, threads: int) -> tuple[Array, Array]:
+        term, part = step.term, step.part
+        if isinstance(part, Collimated):
+            step.effort.add(len(elements), 1)
+            return closed_forms.collimated(term, part, elements)
+        if step.method is Method.MIRROR:
+            return closed_forms.mirror_cap(term, part, elements)
+        if isinstance(part, Field):
+            return over_field(term, part, elements, rtol=self.rtol, atol=self.atol, effort=step.effort)
+        if step.method is Method.LAMBERT:
+            return closed_forms.lambertian_cap(term, part, elements)
+        return integrate_cap(
+            term, part, elements, rtol=self.rtol, atol=self.atol, about_normal=None, effort=step.effort, threads=threads
+        )
+
+    def _table(self, step: Step, cap: Cap, threads: int) -> radial.Table:
+        def profile(tau: Array) -> tuple[Array, Array]:
+            return integrate_cap(
+                step.term, cap, radial.elements(tau), rtol=_SAMPLE * self.rtol, atol=_SAMPLE * self.atol,
+                about_normal=None, effort=step.effort, threads=threads, cautious=False,
+            )  # fmt: skip
+
+        width = min(step.term.lobe_width() or 1.0, 1.0)
+        features = [(math.pi / 2, max(width, 0.05))]
+        if cap.half_angle < math.pi:
+            rim = cap.half_angle if cap.axis[2] > 0 else math.pi - cap.half_angle
+            features.append((0.5 * rim, width))  # the mirror direction is on the rim
+            if cap.half_angle < math.pi / 2:
+                features.append((math.pi / 2 - cap.half_angle, 0.02))  # the rim sets
+        upper = radial.tau_of_slope(self.gradients.steepest)
+        return radial.tabulate(profile, upper, rtol=self.rtol, atol=self.atol, features=features)
