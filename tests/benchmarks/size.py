@@ -48,7 +48,10 @@ def measure(scene: Scene, *, quick: bool) -> list[Cost]:
         if costs and costs[-1].seconds * (n / costs[-1].n) ** 2 > (5.0 if quick else LIMIT_S):
             break
         command = [sys.executable, "-m", "tests.benchmarks.size", scene.surface, scene.light, str(n)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=LIMIT_S)
+        except subprocess.TimeoutExpired:
+            break
         costs.append(Cost(n, *json.loads(done.stdout)))
     return costs
 
