@@ -234,7 +234,7 @@ class _Block:
             mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
             feature.append(mirror[:, None, :])
             # across the plane of incidence the lobe is narrower by cos theta_r
-            widths.append(self.width * np.maximum(self.fixed[:, 2:3], 0.02))
+            widths.append(self.width * np.maximum(self.fixed[:, 2:3], 1e-4))
         if self.light is not None and self.light.peaks is not None and self.light.widths is not None:
             feature.append(self.light.peaks)
             widths.append(np.broadcast_to(self.light.widths, self.light.peaks.shape[:2]))
@@ -334,6 +334,8 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
         # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
         layer = max(1e-9, min(float(fixed[k, 2]), term.lobe_width() or 1.0))
         own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
+        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < 0.05:
+            own.append(_streak(fixed[k], max(1e-9, (term.lobe_width() or 1.0) * float(fixed[k, 2]))))
         if light is not None and light.planes is not None:
             own.append(light.planes[k].tolist())
         rows.append(np.array([row for group in own for row in group]).reshape(-1, 4))
@@ -342,6 +344,14 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
     for k, r in enumerate(rows):
         planes[k, : len(r)] = r
     return planes, counts
+
+
+def _streak(fixed: Array, width: float) -> list[list[float]]:
+    """Circles along the plane of incidence: seen at a grazing angle, a lobe is a streak in it, `width` wide."""
+    sine = math.hypot(fixed[0], fixed[1])
+    steps = [w for w in width * _GROWTH ** np.arange(20) if w < 0.3]
+    offsets = [0.0, *steps, *(-w for w in steps)]
+    return [[-float(fixed[1]) / sine, float(fixed[0]) / sine, 0.0, math.pi / 2 + off] for off in offsets]
 
 
 def _halve(base: Index, box: Array, ways: NDArray[np.int64]) -> tuple[Index, Array]:

@@ -22,6 +22,7 @@ from gonio import jit
 
 Array = NDArray[np.float64]
 MOST_PLANES = 16
+_GROWTH = 8.0  # of panels away from a square root outside them
 _NEAR = 1e-9  # points that close outside a boundary count as on it
 
 # Gauss-Kronrod 7, 15 (R. Piessens et al., QUADPACK, Springer 1983), on [0, 1]
@@ -91,7 +92,8 @@ def _build(axis, half_angle, about_normal, planes, counts, frames, circles, cell
     """
     two_pi = 2.0 * math.pi
     total = 0
-    points = np.empty(8 + 4 * planes.shape[1] * planes.shape[1])
+    room = 8 + 4 * planes.shape[1] * planes.shape[1]
+    points, ends = np.empty(room + 40 * (8 + 4 * planes.shape[1])), np.empty(room + 2)
     touch = np.empty(8 + 4 * planes.shape[1])
     order = np.empty((2 * planes.shape[1] + 2, 4))
     rim = math.cos(half_angle)
@@ -158,6 +160,19 @@ def _build(axis, half_angle, about_normal, planes, counts, frames, circles, cell
                         v = x * e[1, 0] + y * e[1, 1] + z * e[1, 2]
                         w = x * e[2, 0] + y * e[2, 1] + z * e[2, 2]
                         n_t = _add(points, n_t, math.atan2(math.hypot(u, v), w), t_end)
+        known = n_t
+        ends[0], ends[n_t + 1] = 0.0, t_end
+        for i in range(n_t):
+            ends[i + 1] = points[i]
+        for j in range(n_touch):  # a square root that begins just outside a long panel: grade that panel towards it
+            for i in range(known + 2):
+                if abs(ends[i] - touch[j]) < 1e-12:
+                    for side in (-1, 1):
+                        if 0 <= i + 2 * side <= known + 1:
+                            step = _GROWTH * (ends[i + side] - ends[i])
+                            while step != 0.0 and side * (ends[i + 2 * side] - ends[i] - step) > 0.0:
+                                n_t = _add(points, n_t, ends[i] + step, t_end)
+                                step *= _GROWTH
         for panel in range(n_t + 1):
             a = 0.0 if panel == 0 else points[panel - 1]
             b_end = t_end if panel == n_t else points[panel]
