@@ -100,7 +100,7 @@ def reflectance_map(
         return viewpoint.seen_from(viewer, brdf, source, p, q, rtol, atol, tangent)
     gradients = Gradients(p, q)
     if tangent is not None or not all(term.model.isotropic for term in brdf.terms):
-        viewpoint.with_grain(brdf, gradients.elements(0, 0), None if tangent is None else np.empty(0))  # may complain
+        viewpoint.with_grain(brdf, gradients.elements(), None if tangent is None else np.ravel(tangent))  # may complain
     value, error = np.zeros(gradients.size), np.zeros(gradients.size)
     impulses: list[tuple[float, float, float]] = []
     steps = plan(brdf, Source.of(source))
