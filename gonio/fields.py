@@ -193,8 +193,8 @@ class EnvironmentMap(Field):
         i = np.floor(row).astype(np.intp)
         control = self.control_points
         total = np.zeros(len(directions))
-        across = _b_spline(v)
-        for di, weight in zip(range(-1, 3), _b_spline(row - i), strict=True):
+        across = b_spline(v)
+        for di, weight in zip(range(-1, 3), b_spline(row - i), strict=True):
             for dj, other in zip(range(-1, 3), across, strict=True):
                 total += weight * other * control[i + di + 2, (j + dj) % n_phi]
         return total
@@ -213,7 +213,7 @@ class EnvironmentMap(Field):
         return control
 
 
-def _b_spline(t: Array) -> tuple[Array, Array, Array, Array]:
+def b_spline(t: Array) -> tuple[Array, Array, Array, Array]:
     """Values of the four uniform cubic B-splines that cover a point t in [0, 1) between two knots."""
     s = 1.0 - t
     return s**3 / 6.0, (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * s**2 + 3.0 * s**3) / 6.0, t**3 / 6.0

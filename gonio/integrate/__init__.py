@@ -105,7 +105,7 @@ def reflectance_map(
     impulses: list[tuple[float, float, float]] = []
     steps = plan(brdf, Source.of(source))
     run = Run(gradients, None if tangent is None else np.ravel(tangent), rtol, atol / max(1, len(steps)), threads)
-    for step in steps:
+    for step in sorted(steps, key=lambda s: s.method is Method.RINGS):  # these use what is left of the tolerance
         start = time.perf_counter()
         if step.method is Method.IMPULSE:
             assert isinstance(step.part, Collimated)

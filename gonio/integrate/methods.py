@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.fields import Field
-from gonio.integrate import closed_forms, disk, radial
+from gonio.integrate import closed_forms, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients, add_beam, add_diffuse
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
+from gonio.integrate.rings import integrate_rings
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
@@ -52,9 +53,14 @@ class Run:
         by_tile = self._by_tile(step, count)
         if by_tile is not None:
             return max(tiling.run(lambda tile: by_tile(tile, value, error), self.gradients.tiles(), count), default=0.0)
-        if isinstance(step.part, Cap) and step.method is Method.GENERAL and disk.suits(step.term, step.part):
-            return self._disk(step, step.part, count, value, error)
         elements = self.gradients.elements()
+        if step.method is Method.RINGS and isinstance(step.part, Field):
+            # what the steps before leave of the tolerance, which is relative to their sum
+            spare = np.maximum(self.atol, 0.5 * (self.rtol * np.abs(value) - error))
+            v, e = self._rings(step, step.part, elements, spare, count)
+            value += v
+            error += e
+            return float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
         if not step.term.model.isotropic and self.tangent is not None:
             elements = elements.turned(self.tangent)
         v, e = self._by_element(step, elements, count)
@@ -76,22 +82,18 @@ class Run:
             return functools.partial(table.add, grid)
         return None
 
-    def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
-        """Most gradients by rules for small disks, the others by the general rule."""
-        done = tiling.run(
-            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, value, error),
-            self.gradients.tiles(),
-            threads,
-        )
-        step.effort.add(sum(nodes for _, nodes, _ in done), 1)
-        worst = max((relative for relative, _, _ in done), default=0.0)
-        left = np.concatenate([index for _, _, index in done]) if done else np.empty(0, dtype=np.intp)
-        if left.size:
-            v, e = self._by_element(step, self.gradients.elements().select(left), threads)
-            value[left] += v
-            error[left] += e
-            worst = max(worst, float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0))))
-        return worst
+    def _rings(self, step: Step, field: Field, elements: Elements, spare: Array, threads: int) -> tuple[Array, Array]:
+        """By rings; the few elements that they leave above their tolerance by adaptive cells."""
+        v, e = integrate_rings(step.term, field, elements, rtol=self.rtol, atol=spare, effort=step.effort, cores=threads)
+        missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
+        if 0 < missed.size <= _FEW:
+            atol = float(spare[missed].min())
+            again, left = over_field(
+                step.term, field, elements.select(missed), rtol=self.rtol, atol=atol, effort=step.effort
+            )
+            better = left < e[missed]
+            v[missed[better]], e[missed[better]] = again[better], left[better]
+        return v, e
 
     def _by_element(self, step: Step, elements: Elements, threads: int) -> tuple[Array, Array]:
         term, part = step.term, step.part

@@ -22,6 +22,7 @@ class Method(enum.Enum):
     IMPULSE = "closed form 15a"
     RADIAL = "one-dimensional in theta_n"
     GENERAL = "quadrature per gradient"
+    RINGS = "rings about the view axis"
     FIELD = "quadrature of a field per gradient"
 
 
@@ -76,6 +77,8 @@ def _step(term: Term, part: Part) -> Step:
         return Step(term, part, Method.BEAM, "a beam: one evaluation per gradient; back-facing gradients are 0")
     if mirror:
         return Step(term, part, Method.MIRROR, "a mirror: the source seen in the mirror direction")
+    if isinstance(part, Field) and term.model.isotropic and term.model.function is not None:
+        return Step(term, part, Method.RINGS, "isotropic: one kernel for all phi_n, the field's waves apart")
     if isinstance(part, Field):
         return Step(term, part, Method.FIELD, "a radiance field: cells between its edges and the surface's horizon")
     if closed_forms.is_lambertian_cap(term, part):

@@ -1,0 +1,113 @@
+"""A term and a field as `ring_kernel` takes them, and what its sums over rings tell about their own errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf.base import Term
+from gonio.integrate import threads
+from gonio.integrate.quadrature import Effort
+from gonio.integrate.ring_kernel import gauss_table, ring_kernel
+from gonio.integrate.spectrum import Spectrum
+
+Array = NDArray[np.float64]
+EPS = float(np.finfo(float).eps)
+MOST_DIGITS = 14.0
+NONE = 1e9  # [rad], a width that means: no such feature
+FIRST_WAVES = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the kernel needs beyond the slopes."""
+
+    term: Term
+    rings: Spectrum
+    rows: bool
+    width: float
+    threads: int
+    effort: Effort
+    first_waves: int  # to begin with
+
+    def sums(self, tau: Array, digits: float, waves: int) -> Array:
+        """A_m, B_m and the size of K_m for slopes tan(theta_n / 2), shape (n, 3, waves)."""
+        slopes = np.stack(((1.0 - tau) * (1.0 + tau), 2.0 * tau), axis=1) / (1.0 + tau * tau)[:, None]
+        layers = self._layers(slopes[:, 0])
+        planes = self._planes(slopes)
+        out = np.zeros((len(tau), 3, waves))
+        x, w = gauss_table()
+        kernel: Any = ring_kernel(self.term.model.function)
+
+        def work(tile: slice) -> int:
+            effort = np.zeros(1, dtype=np.int64)
+            kernel(
+                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], planes[tile], self.rings.breaks,
+                self.rings.series, self.rings.used, self.rows, digits * math.log(10.0), x, w, out[tile], effort,
+            )  # fmt: skip
+            return int(effort[0])
+
+        tiles = [slice(k, k + 2) for k in range(0, len(tau), 2)]
+        self.effort.add(sum(threads.run(work, tiles, self.threads)), math.ceil(digits))
+        return out
+
+    def _layers(self, cosine: Array) -> Array:
+        """Width of the structure at the surface's horizon [rad]."""
+        if self.width < NONE:
+            return np.maximum(np.minimum(self.width, cosine), 1e-9)
+        if self.term.model.diffuse:
+            return np.full(len(cosine), NONE)
+        return np.maximum(cosine, 1e-9)
+
+    def _planes(self, slopes: Array) -> Array:
+        """Planes of kinks in the local frames, shape (n, k, 4), filled up with planes that meet no direction."""
+        planes = [self.term.kinks(np.array((-s, 0.0, c))) for c, s in slopes]
+        most = max(len(p) for p in planes)
+        filled = np.zeros((len(slopes), most, 4))
+        filled[..., 2:] = 1.0, 2.0
+        for k, given in enumerate(planes):
+            filled[k, : len(given)] = given
+        return filled
+
+
+def first_digits(rtol: float) -> float:
+    return min(MOST_DIGITS - 3.0, max(2.0, -1.0 - math.log10(rtol)))
+
+
+def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:
+    """Values at phi = (j + shift) 2 pi / columns, shape (..., columns), of sums (..., 2 or more, waves)."""
+    m = np.arange(sums.shape[-1])
+    half = 0.5 * columns * (sums[..., 0, :] - 1j * sums[..., 1, :])
+    half[..., 0] = columns * sums[..., 0, 0]
+    half = half * np.exp(2j * np.pi * m * shift / columns)
+    values: Array = np.fft.irfft(half, columns, axis=-1)
+    return values
+
+
+def tail_of(sums: Array, rings: Spectrum) -> Array:
+    """What waves beyond the last may add, shape (n,): 0 if there are none, else thrice the norm of the last quarter."""
+    waves = sums.shape[2]
+    if rings.beyond[waves] == 0.0:
+        return np.zeros(len(sums))
+    tail: Array = 3.0 * np.sqrt(np.sum(sums[:, :2, 3 * waves // 4 :] ** 2, axis=(1, 2)))
+    return tail
+
+
+def truncated(sums: Array, waves: int) -> Array:
+    """Largest sum of the waves from `waves` on at any azimuth, shape (n,)."""
+    if waves >= sums.shape[2]:
+        return np.zeros(len(sums))
+    rest = sums[:, :2].copy()
+    rest[..., :waves] = 0.0
+    largest: Array = np.abs(on_azimuths(rest, 4 * sums.shape[2])).max(axis=1)
+    return largest
+
+
+def floor_of(scene: Scene, sums: Array) -> float:
+    """Error of the field's series and rounding."""
+    rounding = 4.0 * EPS * (1.0 + 1.0 / scene.width) * float(np.sum(np.abs(sums[:2])))
+    return scene.rings.error * float(sums[2, 0]) + rounding

@@ -1,0 +1,122 @@
+r"""Maps of an isotropic BRDF under any radiance field, seen along the view axis: R(theta_n, phi_n) as one smooth table.
+
+`ring_kernel` gives, for one slope, R as a Fourier series in phi_n. A few gradients are summed from it. For a map the
+slopes are tabulated, piecewise by Chebyshev polynomials of tau = tan(theta_n / 2), which is algebraic in the gradient and
+regular to 90 degrees, and the series on a fine grid of azimuths, from which Lagrange's formula reads any phi_n: the cost of
+a gradient does not depend on BRDF and field.
+
+The error of a piece is that of the table at slopes and azimuths between its nodes, against sums with more digits and more
+waves, times a safety factor; plus that of the field's own series, and rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.brdf.base import Term
+from gonio.fields import EnvironmentMap, Field
+from gonio.integrate import threads
+from gonio.integrate.frames import Elements
+from gonio.integrate.quadrature import Effort
+from gonio.integrate.ring_scene import FIRST_WAVES, MOST_DIGITS, NONE, Scene, first_digits, floor_of, tail_of
+from gonio.integrate.ring_table import by_table
+from gonio.integrate.spectrum import spectrum
+
+Array = NDArray[np.float64]
+FEW = 96  # distinct slopes up to which each is summed by itself
+
+
+def integrate_rings(
+    term: Term,
+    field: Field,
+    elements: Elements,
+    *,
+    rtol: float,
+    atol: float | Array,
+    effort: Effort,
+    cores: int | None = None,
+) -> tuple[Array, Array]:
+    """Reflected radiance of each element due to one isotropic term and one field.
+
+    Parameters
+    ----------
+    term : Term
+        For which `applies` holds.
+    field : Field
+    elements : Elements, length n
+        Seen along the view axis.
+    rtol : float
+    atol : float or ndarray, shape (n,)
+        Tolerance per element. An element that does not reach it keeps its honest error.
+    effort : Effort
+        Added to.
+    cores : int, optional
+        Threads; all cores without it. The result does not depend on it.
+
+    Returns
+    -------
+    value, error : ndarray, shape (n,)
+        [W m^-2 sr^-1].
+    """
+    tau = elements.sin_theta / (1.0 + elements.cos_theta)
+    phi = np.arctan2(elements.sin_phi, elements.cos_phi)
+    columns = field.samples.shape[1] if isinstance(field, EnvironmentMap) else 0
+    scene = Scene(
+        term,
+        spectrum(field, max(1e-6 * rtol, 1e-14)),
+        isinstance(field, EnvironmentMap),
+        term.lobe_width() or NONE,
+        cores or threads.available(),
+        effort,
+        # of a map beyond the first copy of its spectrum, as what its kinks add starts there
+        max(FIRST_WAVES, min(400, 3 * columns // 2)),
+    )
+    allowed = np.broadcast_to(np.asarray(atol, dtype=float), tau.shape)
+    if len(tau) <= FEW or len(slopes := np.unique(tau)) <= FEW:
+        slopes, where = np.unique(tau, return_inverse=True)
+        return _directly(scene, slopes, where, phi, rtol, allowed)
+    return by_table(scene, tau, phi, rtol, allowed)
+
+
+def _series(sums: Array, phi: Array) -> Array:
+    """Values at azimuths: sums (n, 3, waves), phi (n,)."""
+    m = np.arange(1, sums.shape[2])
+    turn = np.exp(1j * phi)[:, None] ** m
+    values: Array = sums[:, 0, 0] + np.einsum("nm,nm->n", sums[:, 0, 1:], turn.real)
+    values += np.einsum("nm,nm->n", sums[:, 1, 1:], turn.imag)
+    return values
+
+
+def _directly(
+    scene: Scene, slopes: Array, where: NDArray[np.intp], phi: Array, rtol: float, atol: Array
+) -> tuple[Array, Array]:
+    """Each slope by itself, with more digits and more waves until the tolerance is met."""
+    value, error = np.zeros(len(phi)), np.full(len(phi), np.inf)
+    digits = max(4.0, first_digits(rtol))
+    waves = min(scene.rings.waves, scene.first_waves)
+    pending = np.arange(len(slopes))
+    rough = scene.sums(slopes, digits, waves)
+    while True:
+        digits += 3.0
+        fine = scene.sums(slopes[pending], digits, waves)
+        tail = tail_of(fine, scene.rings)
+        for j, k in enumerate(pending):
+            here = np.flatnonzero(where == k)
+            exact = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
+            before = _series(np.broadcast_to(rough[j], (len(here), *rough[j].shape)), phi[here])
+            value[here] = exact
+            error[here] = np.abs(exact - before) + tail[j] + floor_of(scene, fine[j])
+        missed = error > np.maximum(rtol * np.abs(value), atol)
+        again = np.isin(pending, where[missed])
+        more_waves = bool(np.any(tail > 0.0)) and waves < scene.rings.waves
+        if not np.any(again) or (digits >= MOST_DIGITS and not more_waves):
+            return value, error
+        pending, tail_limited = pending[again], tail[again] > 0.3 * np.abs(fine[again, 0, 0]) * rtol
+        rough = fine[again]
+        if np.any(tail_limited) and waves < scene.rings.waves:
+            waves = min(scene.rings.waves, 2 * waves)
+            digits -= 3.0
+            rough = scene.sums(slopes[pending], digits, waves)
+        elif digits >= MOST_DIGITS:
+            return value, error

@@ -1,0 +1,220 @@
+r"""A radiance field on rings about the view axis: Fourier series in azimuth, piecewise polynomials in polar angle.
+
+.. math:: L(\theta, \phi) = a_0(\theta) + \sum_{m\ge 1} a_m(\theta)\cos m\phi + b_m(\theta)\sin m\phi
+
+Maps give their coefficients exactly: on a ring the bilinear map is a sum of hat functions, the smooth one of cubic
+B-splines, so the transform of the samples times sinc^2 or sinc^4 of m / n_phi, and between two rows both are polynomials of
+theta. Other fields are sampled: panels in theta are halved, and azimuths doubled, until values between the nodes agree.
+
+References
+----------
+.. [1] L. N. Trefethen, Approximation Theory and Approximation Practice, SIAM, 2013, chapter 3.
+.. [2] M. Unser, A. Aldroubi, M. Eden, "B-Spline Signal Processing", IEEE Trans. Signal Process. 41(2), 1993, eq. 2.9.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio.errors import IntegrationError
+from gonio.fields import EnvironmentMap, Field, FunctionField, Lobes, b_spline
+from gonio.geometry import unit_vector
+
+Array = NDArray[np.float64]
+EPS = float(np.finfo(float).eps)
+_DEGREE = 11
+_LARGEST = 1 << 14  # azimuths of a ring
+_DEEPEST = 20  # halvings of a panel
+_MAP_WAVES = 16  # waves kept of a map, in units of its columns
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """The series on panels.
+
+    Attributes
+    ----------
+    breaks : ndarray, shape (p + 1,)
+        Edges of the panels, 0 to pi [rad].
+    series : ndarray, shape (p, degree + 1, 2, waves)
+        Chebyshev coefficients of a_m and b_m on each panel.
+    used : ndarray of int, shape (p,)
+        How many waves are not negligible on a panel.
+    error : float
+        Largest error of the radiance, truncation apart for maps [W m^-2 sr^-1].
+    beyond : ndarray, shape (waves + 1,)
+        Bound of the sum of all waves from m on, at any theta, also those that are not kept [W m^-2 sr^-1].
+    scale : float
+        Largest radiance.
+    """
+
+    breaks: Array
+    series: Array
+    used: NDArray[np.int64]
+    error: float
+    beyond: Array
+    scale: float
+
+    @property
+    def waves(self) -> int:
+        """Number of terms of the Fourier series, m = 0 to waves - 1."""
+        return int(self.series.shape[3])
+
+
+@functools.lru_cache(maxsize=16)
+def spectrum(field: Field, tolerance: float) -> Spectrum:
+    """The series of a field.
+
+    Parameters
+    ----------
+    field : Field
+    tolerance : float
+        Largest error of the radiance, relative to its largest value.
+
+    Raises
+    ------
+    IntegrationError
+        If a field's rings need more than 16384 azimuths.
+    """
+    if isinstance(field, EnvironmentMap):
+        return _of_map(field, tolerance)
+    return _of_samples(field, tolerance)
+
+
+def _to_series(degree: int) -> tuple[Array, Array]:
+    """Chebyshev nodes in [-1, 1] and the matrix from values there to coefficients."""
+    nodes: Array = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    matrix = np.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, degree)), dtype=np.float64)
+    return nodes, matrix
+
+
+def _of_map(field: EnvironmentMap, tolerance: float) -> Spectrum:
+    n_theta, n_phi = field.samples.shape
+    waves = _MAP_WAVES * n_phi if field.interpolation == "bilinear" else 4 * n_phi
+    waves = min(waves, max(1024, 4 * n_phi)) + 1
+    m = np.arange(waves)
+    # c_m of a row: (1 / n) sum_j x_j exp(-i m phi_j), phi_j = (j + 1/2) 2 pi / n, times that of the hat or B-spline
+    rows = field.samples if field.interpolation == "bilinear" else field.control_points
+    transform = np.fft.fft(rows, axis=1)[:, m % n_phi] / n_phi
+    transform *= np.exp(-1j * np.pi * m / n_phi) * np.sinc(m / n_phi) ** (2 if field.interpolation == "bilinear" else 4)
+    values = np.stack((transform.real, -transform.imag), axis=1) * np.where(m == 0, 1.0, 2.0)  # (rows, 2, waves)
+    centres = np.pi * (np.arange(n_theta) + 0.5) / n_theta
+    breaks = np.concatenate(([0.0], centres, [np.pi]))
+    if field.interpolation == "bilinear":
+        padded = np.concatenate((values[:1], values, values[-1:]))
+        above, below = padded[:-1], padded[1:]
+        series = np.stack((0.5 * (above + below), 0.5 * (below - above)), axis=1)
+    else:
+        nodes, matrix = _to_series(3)
+        pieces = []
+        for k in range(n_theta + 1):  # between rows k - 1 and k; the first and the last piece end at a pole, half way
+            lower, upper = (0.5, 1.0) if k == 0 else (0.0, 0.5) if k == n_theta else (0.0, 1.0)
+            weights = np.array(b_spline(lower + (upper - lower) * (nodes + 1.0) / 2.0))  # (4, 4): row, node
+            pieces.append(np.einsum("cn,rn,rpm->cpm", matrix, weights, values[k : k + 4]))
+        series = np.array(pieces)
+    size = np.hypot(*np.moveaxis(np.abs(series).sum(axis=1), 1, 0))  # (panels, waves)
+    scale = field.radiance
+    used = _count_used(size, 0.01 * tolerance * scale)
+    # what is not kept falls as 1/m^2 (smooth: 1/m^4), period by period of the columns
+    rest = 1.1 * waves * float(np.mean(size.max(axis=0)[-n_phi:]))
+    return Spectrum(breaks, np.ascontiguousarray(series), used, 8 * EPS * scale, _beyond(size, rest), scale)
+
+
+def _beyond(size: Array, rest: float) -> Array:
+    """Sums of the largest waves from m on, and `rest`."""
+    return np.concatenate((np.cumsum(size.max(axis=0)[::-1])[::-1], [0.0])) + rest
+
+
+def _count_used(size: Array, negligible: float) -> NDArray[np.int64]:
+    """Waves up to which the sum of what follows exceeds `negligible`; at least one."""
+    remaining = np.cumsum(size[:, ::-1], axis=1)[:, ::-1]
+    used: NDArray[np.int64] = np.maximum(1, (remaining > negligible).sum(axis=1)).astype(np.int64)
+    return used
+
+
+def _first_breaks(field: Field) -> list[float]:
+    points = {0.0, math.pi}
+    if isinstance(field, Lobes):
+        for a, kappa, theta in zip(field.amplitude, field.kappa, field.theta, strict=True):
+            width = 2.0 / math.sqrt(max(kappa, 1.0))
+            step = width
+            while a > 0 and step < math.pi:
+                points |= {t for t in (theta - step, theta + step) if 0.0 < t < math.pi}
+                step *= 2.0
+    longest = 0.8 if isinstance(field, Lobes) else max(3.0 * field.detail, 0.01)
+    ordered = sorted(points)
+    breaks = [0.0]
+    for b in ordered[1:]:
+        a = breaks[-1]
+        if b - a < 0.02 * field.detail and b < math.pi:
+            continue  # two lobes' panels nearly coincide
+        pieces = math.ceil((b - a) / longest)
+        breaks += [a + (b - a) * (k + 1) / pieces for k in range(pieces)]
+    return breaks
+
+
+def _of_samples(field: Field, tolerance: float) -> Spectrum:
+    nodes, matrix = _to_series(_DEGREE)
+    probes = np.array([-0.97, -0.3, 0.45, 0.99])
+    at_probes = np.polynomial.chebyshev.chebvander(probes, _DEGREE) @ matrix
+    x = np.concatenate((nodes, probes))
+    breaks = _first_breaks(field)
+    azimuths = 1 << max(5, math.ceil(math.log2(4.0 / field.detail)))
+    pending = [(a, b, 0) for a, b in itertools.pairwise(breaks)]
+    scale = _peak(field)
+    done: list[tuple[float, NDArray[np.complex128], float]] = []
+    while pending:
+        a, b, depth = pending.pop(0)
+        theta = a + (b - a) * (x + 1.0) / 2.0
+        while True:
+            values = field.at(_grid(theta, azimuths)).reshape(len(theta), azimuths)
+            transform = np.fft.rfft(values, axis=1) / azimuths
+            scale = max(scale, float(np.max(np.abs(values))))
+            tail = float(np.max(np.sum(np.abs(transform[:, -max(2, azimuths // 8) :]), axis=1)))
+            if tail <= tolerance * scale or azimuths >= _LARGEST:
+                break
+            azimuths *= 2
+        if tail > max(tolerance, 1e-3) * scale and not isinstance(field, FunctionField):
+            raise IntegrationError(f"{field.kind}: a ring of {azimuths} azimuths does not resolve it")
+        missed = float(np.max(np.abs(at_probes @ values[: _DEGREE + 1] - values[_DEGREE + 1 :])))
+        if missed > tolerance * scale and depth < _DEEPEST and len(done) + len(pending) < 2000:
+            middle = 0.5 * (a + b)
+            pending[:0] = [(a, middle, depth + 1), (middle, b, depth + 1)]
+            continue
+        done.append((b, matrix @ transform[: _DEGREE + 1], 2.0 * missed + 2.0 * tail))
+    waves = max(waved.shape[1] for _, waved, _ in done)
+    table = np.zeros((len(done), _DEGREE + 1, 2, waves))
+    for k, (_, waved, _) in enumerate(done):
+        width = waved.shape[1]
+        table[k, :, 0, :width], table[k, :, 1, :width] = waved.real, -waved.imag
+    table[..., 1:] *= 2.0
+    negligible = 0.1 * tolerance * scale
+    size = np.hypot(*np.moveaxis(np.abs(table).sum(axis=1), 1, 0))
+    used = _count_used(size, negligible)
+    error = max(e for *_, e in done) + negligible + 8.0 * EPS * scale
+    waves = int(used.max())
+    table = np.ascontiguousarray(table[..., :waves])
+    return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, used, error, _beyond(size[:, :waves], 0.0), scale)
+
+
+def _grid(theta: Array, azimuths: int) -> Array:
+    """Directions on rings, shape (len(theta) * azimuths, 3)."""
+    phi = 2.0 * np.pi * np.arange(azimuths) / azimuths
+    directions = np.empty((len(theta), azimuths, 3))
+    np.multiply.outer(np.sin(theta), np.cos(phi), out=directions[..., 0])
+    np.multiply.outer(np.sin(theta), np.sin(phi), out=directions[..., 1])
+    directions[..., 2] = np.cos(theta)[:, None]
+    return directions.reshape(-1, 3)
+
+
+def _peak(field: Field) -> float:
+    if isinstance(field, Lobes):
+        return float(np.max(field.at(field.axes())))
+    phi = 2.399963 * np.arange(400)  # the golden angle spreads points evenly
+    return float(np.max(np.abs(field.at(unit_vector(np.arccos(1.0 - (np.arange(400) + 0.5) / 200.0), phi)))))

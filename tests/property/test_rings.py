@@ -1,0 +1,123 @@
+"""Maps under radiance fields: against the general quadrature, a product rule written here, each other, and rotations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import gonio
+from gonio.geometry import gradient_from_normal, unit_vector
+from gonio.integrate import scene_radiance
+from gonio.integrate.plan import Method
+
+make_source, make_brdf = gonio.source.make, gonio.brdf.make
+Array = NDArray[np.float64]
+LOBES = {"amplitude": [1.0, 2.0, 0.5, 3.0], "kappa": [100.0, 30.0, 8.0, 60.0],
+         "theta": [0.3, 1.0, 2.0, 0.8], "phi": [0.0, 2.0, 4.0, 5.5]}  # fmt: skip
+SKY = make_source("uniform", radiance=0.2) + make_source("lobes", **LOBES)
+CENTRES = (np.arange(32) + 0.5) * np.pi / 32
+GRID = SKY.radiance(unit_vector(CENTRES[:, None], (np.arange(64) + 0.5)[None, :] * np.pi / 32))
+SOURCES = {
+    "lobes": SKY,
+    "function": gonio.source.Source.from_callable(SKY.radiance),
+    "smooth": make_source("environment_map", radiance=GRID, interpolation="smooth"),
+    "bilinear": make_source("environment_map", radiance=GRID),
+    "harmonics": make_source("spherical_harmonics", coefficients=[3.0, 0.5, 0.6, 0.2, 0.1, 0.0, 0.3, 0.2, 0.1]),
+}
+AXIS = np.linspace(-3.0, 3.0, 33)
+RTOL = {"bilinear": 1e-4}
+
+
+def brdf(alpha: float) -> gonio.BRDF:
+    return make_brdf("lambertian", albedo=0.5) + make_brdf("ggx", k_s=1.0, alpha=alpha, f_0=0.04)
+
+
+def product_rule(material: gonio.BRDF, source: gonio.source.Source, p: float, q: float, n: int = 300) -> float:
+    """What a user would write, about the normal: Gauss in cos theta_i, trapezoid in azimuth."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    z, phi = 0.5 * (x + 1.0), 2.0 * np.pi * (np.arange(2 * n) + 0.5) / (2 * n)
+    s = np.sqrt(1.0 - z**2)
+    local = np.stack(np.broadcast_arrays(s[:, None] * np.cos(phi), s[:, None] * np.sin(phi), z[:, None]), axis=-1)
+    local = local.reshape(-1, 3)
+    normal = np.array([-p, -q, 1.0]) / math.sqrt(1.0 + p * p + q * q)
+    tangent = np.cross([0.0, 1.0, 0.0], normal)
+    tangent /= np.linalg.norm(tangent)
+    frame = np.stack((tangent, np.cross(normal, tangent), normal))
+    f_r = material.evaluate(local, np.broadcast_to(frame[:, 2], local.shape))
+    return float(np.sum(np.repeat(0.5 * w * z, 2 * n) * (np.pi / n) * f_r * source.radiance(local @ frame)))
+
+
+@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize("alpha", [0.3, 0.05])
+def test_maps_keep_their_promise(name: str, alpha: float) -> None:
+    """A grid goes through the table, a few gradients through single sums with 1000 times the accuracy."""
+    rtol = RTOL.get(name, 1e-6)
+    grid = gonio.reflectance_map(brdf(alpha), SOURCES[name], AXIS[None, :], AXIS[:, None], rtol=rtol)
+    assert any(step.method is Method.RINGS for step in grid.plan)
+    rows, columns = np.random.default_rng(1).integers(0, 33, (2, 12))
+    truth = gonio.reflectance_map(brdf(alpha), SOURCES[name], AXIS[columns], AXIS[rows], rtol=max(1e-9, 1e-2 * rtol))
+    off = np.abs(grid.value[rows, columns] - truth.value)
+    assert np.all(off <= grid.error[rows, columns] + truth.error)
+    assert np.all(off <= rtol * truth.value)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_against_the_general_quadrature(name: str) -> None:
+    """The general rule shares neither nodes nor the waves of the field with the rings."""
+    theta_n, phi_n = np.array([0.0, 0.6, 1.2]), np.array([0.0, 2.0, 5.0])
+    rtol = 1e-5 if name == "bilinear" else 1e-7
+    rings = gonio.reflectance_map(brdf(0.2), SOURCES[name], *gradient_from_normal(theta_n, phi_n), rtol=rtol)
+    nodes = scene_radiance(brdf(0.2), SOURCES[name], theta_n, phi_n, rtol=rtol)
+    assert np.all(np.abs(rings.value - nodes.value) <= rings.error + nodes.error)
+    assert np.all(np.abs(rings.value - nodes.value) <= 2.0 * rtol * nodes.value)
+
+
+@pytest.mark.parametrize("name", ["lobes", "smooth", "harmonics"])
+def test_against_a_plain_product_rule(name: str) -> None:
+    for p, q in ((0.4, -0.2), (-1.5, 0.8)):
+        truth = product_rule(brdf(0.3), SOURCES[name], p, q)
+        got = gonio.reflectance_map(brdf(0.3), SOURCES[name], p, q, rtol=1e-8)
+        assert float(got.value) == pytest.approx(truth, rel=2e-6 if name == "smooth" else 1e-8)
+
+
+def test_turning_the_field_turns_the_map() -> None:
+    turn = 0.7
+    turned = make_source("lobes", **(LOBES | {"phi": [phi + turn for phi in LOBES["phi"]]}))
+    theta_n, phi_n = np.random.default_rng(2).uniform(0.0, 1.3, 200), np.linspace(0.0, 6.0, 200)
+    first = gonio.reflectance_map(brdf(0.1), make_source("lobes", **LOBES), *gradient_from_normal(theta_n, phi_n), rtol=1e-7)
+    second = gonio.reflectance_map(brdf(0.1), turned, *gradient_from_normal(theta_n, phi_n + turn), rtol=1e-7)
+    assert np.all(np.abs(first.value - second.value) <= first.error + second.error)
+    assert np.all(np.abs(first.value - second.value) <= 2e-7 * first.value)
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "smooth"])
+def test_a_constant_map_is_a_uniform_source(interpolation: str) -> None:
+    constant = make_source("environment_map", radiance=np.full((8, 16), 2.0), interpolation=interpolation)
+    p, q = np.array([0.0, 0.5, -2.0, 10.0]), np.array([0.0, -0.3, 1.0, 4.0])
+    white = make_brdf("lambertian", albedo=1.0)
+    got = gonio.reflectance_map(white, constant, p, q, rtol=1e-10)
+    assert np.max(np.abs(got.value - 2.0)) <= 1e-10
+    satin = brdf(0.3)
+    uniform = gonio.reflectance_map(satin, make_source("uniform", radiance=2.0), p, q, rtol=1e-10)
+    got = gonio.reflectance_map(satin, constant, p, q, rtol=1e-9)
+    assert np.all(np.abs(got.value - uniform.value) <= got.error + uniform.error)
+
+
+def test_a_narrow_lobe_is_a_beam() -> None:
+    """kappa = 1e5: half a degree wide; as a beam of its irradiance, 2 pi a / kappa, up to the square of its width."""
+    lobe = make_source("lobes", amplitude=1.0, kappa=1e5, theta=0.6, phi=1.0)
+    beam = make_source("collimated", theta=0.6, phi=1.0, irradiance=2.0 * np.pi / 1e5)
+    p, q = np.array([0.2, -1.0, -0.3]), np.array([-0.4, -0.3, -0.8])
+    rough = make_brdf("ggx", k_s=1.0, alpha=0.3, f_0=0.5)
+    wide, narrow = (gonio.reflectance_map(rough, s, p, q, rtol=1e-6).value for s in (lobe, beam))
+    assert np.all(wide > 0.0) and np.allclose(wide, narrow, rtol=1e-3)
+
+
+def test_the_result_does_not_depend_on_threads() -> None:
+    one, two = (
+        gonio.reflectance_map(brdf(0.1), SKY, AXIS[None, :], AXIS[:, None], rtol=1e-5, threads=n).value for n in (1, 2)
+    )
+    assert np.array_equal(one, two)
