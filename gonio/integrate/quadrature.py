@@ -122,6 +122,8 @@ def integrate_cap(
     done = ~lit
     totals = np.full((5, n), np.nan)  # of the last orders, newest first
     kinked = scene.planes.shape[1] > 0
+    crossed = lit & _rim_crosses_kink(scene) if kinked and cautious else np.zeros(n, dtype=np.bool_)
+    done |= crossed
     for k, order in enumerate(ORDERS[:-3] if kinked else ORDERS):
         active = np.flatnonzero(~done & (first <= k))
         if not active.size:
@@ -137,7 +139,7 @@ def integrate_cap(
         error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
         if np.all(done):
             break
-    rest = np.flatnonzero(~done)
+    rest = np.flatnonzero(~done | crossed)
     if kinked and rest.size:  # edges that cross
         value[rest], error[rest] = over_cap(
             term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=True, effort=effort
@@ -169,6 +171,17 @@ def _scene(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) 
     symmetric = (axis[:, 1] == 0.0) & term.model.isotropic & (not term.model.own)
     cos_n = np.maximum(elements.cos_theta, _LIMB)
     return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, planes, symmetric)
+
+
+def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
+    """Elements for which a kink meets the cap's rim: rings are not smooth there, and their orders can agree on less."""
+    if scene.cap.half_angle >= math.pi:
+        return np.zeros(len(scene.cos_n), dtype=np.bool_)
+    centre, half = scene.planes[:, :, :3], np.arccos(np.clip(scene.planes[:, :, 3], -1.0, 1.0))
+    apart = np.arccos(np.clip(np.einsum("nkj,nj->nk", centre, scene.axis), -1.0, 1.0))
+    rim = scene.cap.half_angle
+    meet = (np.abs(apart - half) < rim) & (rim < np.minimum(apart + half, 2.0 * math.pi - apart - half))
+    return np.asarray(np.any(meet & (np.abs(scene.planes[:, :, 3]) < 1.0), axis=1))
 
 
 def _rounding(scene: _Scene) -> Array:
