@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.fields import Field
-from gonio.integrate import closed_forms, radial
+from gonio.integrate import closed_forms, disk, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
@@ -53,6 +53,8 @@ class Run:
         by_tile = self._by_tile(step, count)
         if by_tile is not None:
             return max(tiling.run(lambda tile: by_tile(tile, value, error), self.gradients.tiles(), count), default=0.0)
+        if isinstance(step.part, Cap) and step.method is Method.GENERAL and disk.suits(step.term, step.part):
+            return self._disk(step, step.part, count, value, error)
         elements = self.gradients.elements()
         if step.method is Method.RINGS and isinstance(step.part, Field):
             # what the steps before leave of the tolerance, which is relative to their sum
@@ -81,6 +83,23 @@ class Run:
             table = self._table(step, part, threads)
             return functools.partial(table.add, grid)
         return None
+
+    def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
+        """Most gradients by rules for small disks, the others by the general rule."""
+        done = tiling.run(
+            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, value, error),
+            self.gradients.tiles(),
+            threads,
+        )
+        step.effort.add(sum(nodes for _, nodes, _ in done), 1)
+        worst = max((relative for relative, _, _ in done), default=0.0)
+        left = np.concatenate([index for _, _, index in done]) if done else np.empty(0, dtype=np.intp)
+        if left.size:
+            v, e = self._by_element(step, self.gradients.elements().select(left), threads)
+            value[left] += v
+            error[left] += e
+            worst = max(worst, float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0))))
+        return worst
 
     def _rings(self, step: Step, field: Field, elements: Elements, spare: Array, threads: int) -> tuple[Array, Array]:
         """By rings; the few elements that they leave above their tolerance by adaptive cells."""
