@@ -34,6 +34,7 @@ _PER_WIDTH, _PER_LAYER = 1.3, 2.0  # nodes per unit of the sinh maps of lobe and
 _NO_LOBE = 1e9  # [rad]
 _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
 _TILE = 1 << 15  # nodes evaluated at once: they stay in the cache
+_WORTH = 1 << 17  # nodes below which several threads gain nothing
 _LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
 _NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
 _BROAD = 0.5  # lobe width [rad] from which a lobe does not matter for that choice
@@ -221,6 +222,8 @@ def _sums(scene: _Scene, active: NDArray[np.intp], order: int, threads: int) -> 
     size = max(1, _TILE // (3 * order * order))
     out = np.empty(active.size)
     work = functools.partial(_tile, scene, active, out, order, size)
+    if 3 * order * order * active.size < _WORTH:
+        threads = 1
     return out, sum(tiling.run(work, range(0, active.size, size), threads))
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gonio import jit
 from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate.plan import Step
 
@@ -56,15 +58,32 @@ def insist(result: MapValues, rtol: float, atol: float) -> MapValues:
     ParameterError
         If a value is NaN or infinite, which only a function of the user's can make it.
     """
-    value, error = result.value, result.error
-    if not np.all(np.isfinite(value)):
+    value, error = result.value.ravel(), result.error.ravel()
+    missed, largest, worst = _missed(value, error, rtol, atol)
+    if not math.isfinite(largest):
         raise ParameterError("f_r or the radiance is NaN or infinite for a direction above the horizon; both must be finite")
-    missed = error > np.maximum(rtol * np.abs(value), atol) * (1 + 1e-9) + 1e-300
-    if np.any(missed & (error > 1e-13 * np.max(np.abs(value), initial=0.0))):
-        worst = float(np.max(np.divide(error, np.abs(value), out=np.zeros_like(error), where=value != 0)))
+    if missed:
         raise IntegrationError(
             f"reflectance map: reached a relative error of {worst:.1e} where {rtol:.1e} was asked for, at "
-            f"{int(missed.sum())} of {value.size} gradients; ask for a larger rtol or use the result in exc.best",
+            f"{missed} of {value.size} gradients; ask for a larger rtol or use the result in exc.best",
             result,
         )
     return result
+
+
+def _judge(value, error, rtol, atol):  # type: ignore[no-untyped-def]
+    """How many miss the tolerance by more than rounding, largest value (infinite for NaN), largest relative error."""
+    largest = 0.0
+    for k in range(value.size):
+        largest = max(largest, abs(value[k]) if value[k] == value[k] else math.inf)
+    missed, worst = 0, 0.0
+    for k in range(value.size):
+        size = abs(value[k])
+        if error[k] > max(rtol * size, atol) * (1.0 + 1e-9) + 1e-300 and error[k] > 1e-13 * largest:
+            missed += 1
+        if size > 0.0 and error[k] > worst * size:
+            worst = error[k] / size
+    return missed, largest, worst
+
+
+_missed = jit.kernel(_judge, fastmath=False)
