@@ -151,10 +151,21 @@ def ring_position(x, w, panel, u0, u1):  # type: ignore[no-untyped-def]
 
 
 @jit.model
-def half_ring(a, b, eps, edge, sign, x, w, cosines, sines, weights, count):  # type: ignore[no-untyped-def]
-    """Nodes on [a, b] within [0, pi], d from the mirror direction: cos d, sign sin d, weights; lobe at 0, edge at b."""
+def half_ring(a, b, eps, near, edge, sign, x, w, cosines, sines, weights, count):  # type: ignore[no-untyped-def]
+    """Nodes on [a, b] within [0, pi], d from the mirror direction: cos d, sign sin d, weights.
+
+    Layers: the lobe, eps wide, at 0; edges of width `near` at a and `edge` at b.
+    """
     if not b > a:
         return count
+    if near < b - a:
+        u1 = math.asinh((b - a) / near)
+        for j in range(x.size):
+            e = math.exp(u1 * x[j])
+            d = a + 0.5 * near * (e - 1.0 / e)
+            cosines[count + j], sines[count + j] = math.cos(d), sign * math.sin(d)
+            weights[count + j] = w[j] * 0.5 * near * (e + 1.0 / e) * u1
+        return count + x.size
     e4 = eps / (1.0 + math.sqrt(max(0.0, 1.0 - eps * eps)))
     c = b
     if edge < b:
@@ -279,6 +290,17 @@ def ring_features(cos_n, sin_n, about_normal, width, planes, g, features):  # ty
 
 
 @jit.model
+def insert(points, n, chi):  # type: ignore[no-untyped-def]
+    """Insert into the ascending points; their new number."""
+    j = n
+    while points[j - 1] > chi:
+        points[j] = points[j - 1]
+        j -= 1
+    points[j] = chi
+    return n + 1
+
+
+@jit.model
 def arcs(t, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-def]
     """Azimuths that bound the pieces of a ring, ascending, into points; 0 if all of it is cut away."""
     gamma, delta, chi_m = g[9], g[10], g[13]
@@ -296,13 +318,14 @@ def arcs(t, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-de
             lower, upper = 0.0, math.pi
         else:
             lower = 0.0
-    n = 0
-    points[n] = lower
-    n += 1
+    points[0] = lower
+    n = 1
+    if not (whole or symmetric) and min(abs(chi_m), math.pi - abs(chi_m)) > 1e-12:
+        points[n] = 0.0  # so that a piece has one edge only
+        n += 1
     first = math.ceil((lower - chi_m) / math.pi + 1e-12)
     while chi_m + first * math.pi < upper - 1e-12 and n < points.size - 1:
-        points[n] = chi_m + first * math.pi
-        n += 1
+        n = insert(points, n, chi_m + first * math.pi)
         first += 1
     for k in range(planes.shape[0]):
         cz = planes[k, 0] * g[6] + planes[k, 1] * g[7] + planes[k, 2] * g[8]
@@ -315,12 +338,7 @@ def arcs(t, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-de
                 for turn in (-TWO_PI, 0.0, TWO_PI):
                     chi = centre + sign * half + turn
                     if chi > lower + 1e-12 and chi < upper - 1e-12 and n < points.size - 1:
-                        j = n
-                        while points[j - 1] > chi:
-                            points[j] = points[j - 1]
-                            j -= 1
-                        points[j] = chi
-                        n += 1
+                        n = insert(points, n, chi)
     points[n] = upper
     return n + 1, whole
 
@@ -365,13 +383,18 @@ def element_nodes(  # type: ignore[no-untyped-def]
                 a = c0 - turn * math.pi if even else (turn + 1) * math.pi - c1
                 b = c1 - turn * math.pi if even else (turn + 1) * math.pi - c0
                 a, b = max(a, 0.0), min(b, math.pi)
-                edge = 10.0
-                outer = (even and piece == n_points - 2) or (not even and piece == 0 and not symmetric)
-                if lobe and not about_normal and not whole and outer:
-                    edge = layer / max(sin_gamma * st * abs(math.sin((c1 if even else c0) + chi_m)), 1e-300)
+                near = edge = 10.0
+                if lobe and not about_normal and not whole:
+                    first, last = piece == 0 and not symmetric, piece == n_points - 2
+                    if first or last:
+                        slope = sin_gamma * st * abs(math.sin((c1 if last else c0) + chi_m))
+                        if last == even:
+                            edge = layer / max(slope, 1e-300)
+                        else:
+                            near = layer / max(slope, 1e-300)
                 if m + 2 * x.size > arc.size:
                     return -1
-                m = half_ring(a, b, eps, edge, 1.0 if even else -1.0, x, w, cosines, sines, arc, m)
+                m = half_ring(a, b, eps, near, edge, 1.0 if even else -1.0, x, w, cosines, sines, arc, m)
             if count + m > nodes.shape[1]:
                 return -1
             out_x, out_y, out_z = nodes[0, count : count + m], nodes[1, count : count + m], nodes[2, count : count + m]

@@ -1,0 +1,122 @@
+"""The fast ways of the integrator against its general rule at random and at extreme scenes, and against themselves."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import gonio
+from gonio.brdf.base import BRDF
+from gonio.errors import IntegrationError
+from gonio.geometry import normal_from_gradient
+from gonio.integrate import MapValues, scene_radiance
+from gonio.integrate.frames import Elements
+from gonio.integrate.quadrature import Effort, integrate_cap
+from gonio.source import Cap, Source
+
+make_source, make_brdf = gonio.source.make, gonio.brdf.make
+
+
+def metal(alpha: float) -> BRDF:
+    return make_brdf("ggx", k_s=1.0, alpha=alpha, f_0=0.04)
+
+
+def best(brdf: BRDF, source: Source, p: np.ndarray, q: np.ndarray, rtol: float) -> MapValues:
+    """The map, or what was reached where a tolerance is out of reach."""
+    try:
+        return gonio.reflectance_map(brdf, source, p, q, rtol=rtol)
+    except IntegrationError as exc:
+        assert isinstance(exc.best, MapValues)
+        return exc.best
+
+
+@pytest.mark.parametrize("half_angle_deg", [1e-4, 0.25, 5.0, 15.0])
+@pytest.mark.parametrize("alpha", [0.3, 0.02, 1e-3])
+@pytest.mark.parametrize("rtol", [1e-3, 1e-6])
+def test_disks_near_terminator_and_mirror(half_angle_deg: float, alpha: float, rtol: float) -> None:
+    """Rationale: a disk's map has three rules (whole, cut, near the lobe); their seams are where one could be wrong."""
+    rng = np.random.default_rng(11)
+    delta = math.radians(half_angle_deg)
+    disk = make_source("disk", theta=0.7, phi=0.4, half_angle=delta, radiance=1.0)
+    (part,) = disk.parts
+    assert isinstance(part, Cap)
+    x, y, z = part.axis
+    p, q = rng.normal(size=(2, 120))
+    p[:40] = -x / (1.0 + z) + (delta + alpha) * rng.normal(size=40)  # the mirror direction on the disk or next to it
+    q[:40] = -y / (1.0 + z) + (delta + alpha) * rng.normal(size=40)
+    cut = rng.uniform(-1.2, 1.2, 50) * delta * np.sqrt(1.0 + q[40:90] ** 2)
+    p[40:90] = (z - q[40:90] * y - cut) / x  # the horizon through the disk
+    got = best(metal(alpha), disk, p, q, rtol)
+    truth = scene_radiance(metal(alpha), disk, *normal_from_gradient(p, q), form="viewer", rtol=1e-11)
+    off = np.abs(got.value - truth.value)
+    assert np.all(off <= got.error + truth.error)
+    assert np.all((got.error <= rtol * got.value * (1 + 1e-9)) | (got.value == 0.0) | (half_angle_deg < 0.01))
+    assert np.all((got.value > 0.0) | (truth.value <= truth.error))
+
+
+def test_random_extreme_scenes_have_honest_errors() -> None:
+    """alpha from 1e-4 to 1, views to 1e-6 rad of grazing, caps of any size and axis, mirror directions on their rims."""
+    rng = np.random.default_rng(12)
+    checked = dishonest = 0
+    for _ in range(40):
+        alpha = 10 ** rng.uniform(-4, 0)
+        axis = rng.normal(size=3)
+        source = [
+            make_source("uniform", radiance=1.0),
+            make_source("hemispherical", radiance=1.0, axis=axis),
+            make_source("overcast", zenith_radiance=1.0, axis=axis),
+            make_source("disk", theta=rng.uniform(0, 2), phi=1.0, half_angle=10 ** rng.uniform(-5, 0.19), radiance=1.0),
+        ][rng.integers(4)]
+        (cap,) = source.parts
+        assert isinstance(cap, Cap)
+        theta, phi = np.arccos(rng.uniform(0, 1, 20)), rng.uniform(0, 2 * np.pi, 20)
+        theta[:3] = np.pi / 2 - 10 ** rng.uniform(-6, -1, 3)
+        elements = Elements.from_polar(theta, phi)
+        term = metal(alpha).terms[0]
+        effort = Effort()
+        truth, doubt = integrate_cap(term, cap, elements, rtol=1e-13, atol=0.0, about_normal=None, effort=effort)
+        for rtol in (1e-3, 1e-6, 1e-9):
+            value, error = integrate_cap(term, cap, elements, rtol=rtol, atol=0.0, about_normal=None, effort=effort)
+            assert np.all(np.isfinite(value)) and np.all(value >= 0.0)
+            assert np.all((value > 0.0) | (truth <= doubt))
+            checked += len(value)
+            dishonest += int(np.sum(np.abs(value - truth) > error + doubt))
+    assert checked == 2400 and dishonest == 0
+
+
+def test_results_do_not_depend_on_threads() -> None:
+    axis = np.linspace(-3.0, 3.0, 200)
+    brdf = make_brdf("lambertian", albedo=0.5) + metal(0.05)
+    for source in (
+        make_source("hemispherical", radiance=1.0),
+        make_source("disk", theta=0.7, phi=0.4, half_angle=0.02, radiance=1.0),
+        make_source("collimated", theta=0.7, phi=0.4, irradiance=1.0),
+    ):
+        one, two = (gonio.reflectance_map(brdf, source, axis[None, :], axis[:, None], threads=count) for count in (1, 2))
+        assert np.array_equal(one.value, two.value) and np.array_equal(one.error, two.error)
+
+
+def test_steep_gradients_reach_the_limit() -> None:
+    """As p grows the map tends to its value at the limb, which an infinite component gives; single and in a table."""
+    steep = np.concatenate((np.full(40, 0.3), 10.0 ** np.linspace(2, 16, 60), [1e150, np.inf]))
+    for name in ("uniform", "hemispherical"):
+        source = make_source(name, radiance=1.0)
+        table = gonio.reflectance_map(metal(0.2), source, steep, 0.0, rtol=1e-4)
+        single = gonio.reflectance_map(metal(0.2), source, steep[-20:], 0.0, rtol=1e-6)
+        assert np.all(np.abs(table.value[-20:] - single.value) <= table.error[-20:] + single.error)
+        assert single.value[-1] > 0.0
+        assert single.value[-1] == pytest.approx(float(single.value[-3]), rel=1e-5)
+
+
+def test_gradients_of_any_shape() -> None:
+    source = make_source("hemispherical", radiance=1.0)
+    brdf = metal(0.3)
+    p, q = np.random.default_rng(13).normal(size=(2, 6, 5, 4))
+    whole = gonio.reflectance_map(brdf, source, p, q).value
+    assert whole.shape == (6, 5, 4)
+    flat = gonio.reflectance_map(brdf, source, p.ravel(), q.ravel()).value
+    assert np.array_equal(whole.ravel(), flat)
+    assert gonio.reflectance_map(brdf, source, np.empty(0), 0.0).value.shape == (0,)
+    assert gonio.reflectance_map(brdf, source, np.empty((0, 3)), 0.0).value.shape == (0, 3)
