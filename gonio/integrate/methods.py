@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.fields import Field
+from gonio.fields import EnvironmentMap, Field
 from gonio.integrate import closed_forms, disk, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import over_field
@@ -23,6 +23,8 @@ from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
 _FEW = 64  # gradients up to which a table in theta_n does not pay
+_HANDFUL = 8  # gradients up to which cells are as fast as rings
+_TEXELS = 512  # of a bilinear map up to which its cells are few
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
 
 
@@ -102,10 +104,14 @@ class Run:
         return worst
 
     def _rings(self, step: Step, field: Field, elements: Elements, spare: Array, threads: int) -> tuple[Array, Array]:
-        """By rings; the few elements that they leave above their tolerance by adaptive cells."""
+        """By rings; few elements, and those that rings leave above their tolerance, by adaptive cells."""
+        coarse = not isinstance(field, EnvironmentMap) or field.samples.size <= _TEXELS
+        if coarse and len(elements) <= _HANDFUL:
+            atol = float(np.min(spare, initial=np.inf))
+            return over_field(step.term, field, elements, rtol=self.rtol, atol=atol, effort=step.effort)
         v, e = integrate_rings(step.term, field, elements, rtol=self.rtol, atol=spare, effort=step.effort, cores=threads)
         missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
-        if 0 < missed.size <= _FEW:
+        if 0 < missed.size <= (4 * _FEW if coarse else _FEW):
             atol = float(spare[missed].min())
             again, left = over_field(
                 step.term, field, elements.select(missed), rtol=self.rtol, atol=atol, effort=step.effort

@@ -106,7 +106,7 @@ def _directly(
             exact = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
             before = _series(np.broadcast_to(rough[j], (len(here), *rough[j].shape)), phi[here])
             value[here] = exact
-            error[here] = np.abs(exact - before) + tail[j] + floor_of(scene, fine[j])
+            error[here] = 4.0 * np.abs(exact - before) + tail[j] + floor_of(scene, fine[j])
         missed = error > np.maximum(rtol * np.abs(value), atol)
         again = np.isin(pending, where[missed])
         more_waves = bool(np.any(tail > 0.0)) and waves < scene.rings.waves
