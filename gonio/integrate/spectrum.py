@@ -31,7 +31,7 @@ EPS = float(np.finfo(float).eps)
 _DEGREE = 11
 _LARGEST = 1 << 14  # azimuths of a ring
 _DEEPEST = 20  # halvings of a panel
-_MAP_WAVES = 16  # waves kept of a map, in units of its columns
+_MAP_WAVES = 1024  # waves kept of a map, or four times its columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,7 @@ def _to_series(degree: int) -> tuple[Array, Array]:
 
 def _of_map(field: EnvironmentMap, tolerance: float) -> Spectrum:
     n_theta, n_phi = field.samples.shape
-    waves = _MAP_WAVES * n_phi if field.interpolation == "bilinear" else 4 * n_phi
-    waves = min(waves, max(1024, 4 * n_phi)) + 1
+    waves = max(_MAP_WAVES, 4 * n_phi) + 1
     m = np.arange(waves)
     # c_m of a row: (1 / n) sum_j x_j exp(-i m phi_j), phi_j = (j + 1/2) 2 pi / n, times that of the hat or B-spline
     rows = field.samples if field.interpolation == "bilinear" else field.control_points
