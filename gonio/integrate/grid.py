@@ -46,6 +46,8 @@ class Gradients:
             )
         rows = (1, -1) if len(self.shape) < 2 else (-1, self.shape[-1]) if wide.size else (1, 0)
         self.p, self.q = (a if len(self.shape) == 2 else a.reshape(rows) for a in (wide, high))
+        for view in (self.p, self.q):
+            view.flags.writeable = False  # told apart from the arrays of np.broadcast_arrays, which warn when asked
         self.size = wide.size
         largest = [float(np.max(np.abs(a), initial=0.0)) for a in (first, second)]
         self.steepest = math.hypot(*largest)  # not below the largest slope, and equal to it on a grid
