@@ -130,7 +130,11 @@ def run_gonio(scene: Scene, true: Array, quick: bool) -> list[Run]:
             except LateError:
                 scaled = True
         if scaled:
-            got, seconds, remark = _timed(brdf, source, AXIS[pixels[:, 1]], AXIS[pixels[:, 0]], rtol)
+            try:
+                with at_most(limit_s):
+                    got, seconds, remark = _timed(brdf, source, AXIS[pixels[:, 1]], AXIS[pixels[:, 0]], rtol)
+            except LateError:
+                break
             value, error, seconds = got.value, got.error, seconds * N * N / len(pixels)
         seen = true > FAINT * np.max(true)
         low = np.abs(value - true)[seen] > error[seen] + scene.uncertainty * true[seen]
