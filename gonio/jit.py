@@ -2,8 +2,9 @@
 
 Numba's own cache looks at the file of the kernel only: after an edit of a model that the kernel calls it loads the old
 machine code. Here the key is a fingerprint of the loaded code of the kernel and of everything it calls, with its
-constants, so an edit anywhere recompiles and an undone edit hits again. Each kernel has an index file of its own, so
-processes that start together cannot pick up each other's code. A damaged or read-only cache means compiling again.
+constants, so an edit anywhere recompiles and an undone edit hits again. Each kernel has an index file of its own, and
+symbols are named by content, so kernels of different processes cannot be taken for each other. A damaged or read-only
+cache means compiling again.
 
 This leans on private parts of numba (`FunctionCache`); tests/unit/test_jit.py shows that a second process hits and that
 edits miss.
@@ -27,6 +28,7 @@ from numba.core.dispatcher import Dispatcher
 # reassoc lets sums vectorise; no nnan and no ninf, so NaN and infinity stay what they are
 FAST = {"reassoc", "nsz", "contract", "arcp"}
 _PURE = ("math", "numpy", "numba", "builtins")
+_FORMAT = 2  # of what is kept; a new number discards the old files
 _compiled = 0  # kernels compiled, not loaded, by this process
 
 
@@ -37,6 +39,7 @@ def compiled_count() -> int:
 
 def model(function: Callable[..., Any]) -> Any:
     """Compile a scalar model function: IEEE order kept inside, inlined into the kernels that call it."""
+    _named(function, hashlib.sha256(repr(_fingerprint(function, set())).encode()).hexdigest())
     return numba.njit(error_model="numpy", fastmath=False)(function)
 
 
@@ -56,10 +59,12 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
         If the function uses an object whose content cannot be fingerprinted.
     """
     options = {"error_model": "numpy", "fastmath": FAST, "nogil": True} | options
-    compiled = numba.njit(**options)(function)
     shown = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in options.items())
-    text = repr([numba.__version__, shown, _fingerprint(function, set())])
-    compiled._cache = _Cache(function, hashlib.sha256(text.encode()).hexdigest(), cache_folder())
+    text = repr([_FORMAT, numba.__version__, shown, _fingerprint(function, set())])
+    key = hashlib.sha256(text.encode()).hexdigest()
+    _named(function, key)
+    compiled = numba.njit(**options)(function)
+    compiled._cache = _Cache(function, key, cache_folder())
     return compiled
 
 
@@ -67,6 +72,16 @@ def cache_folder() -> Path:
     """Where kernels are kept: ``$NUMBA_CACHE_DIR``, else ``$XDG_CACHE_HOME``, else ``~/.cache``, then ``gonio``."""
     home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     return (Path(home) if home else Path.home() / ".cache") / "gonio"
+
+
+def _named(function: Callable[..., Any], key: str) -> None:
+    """Make the symbol of the machine code tell its content.
+
+    numba names a symbol after the function's qualified name and a number counted in the process that compiled it. Closures
+    of one factory, compiled by different processes and loaded from the cache into one, may so have the same symbol, and
+    the linker would take the code of whichever came first for all of them.
+    """
+    function.__qualname__ = f"{function.__qualname__}_{key[:24]}"
 
 
 def _fingerprint(value: Any, seen: set[Any]) -> Any:

@@ -61,3 +61,42 @@ def test_objects_that_cannot_be_fingerprinted_are_refused() -> None:
 
     with pytest.raises(TypeError, match="a kernel may not use"):
         jit.kernel(scaled)
+
+
+_FACTORY = """
+import sys
+import numpy as np
+from gonio import jit
+
+def build(power):
+    @jit.model
+    def inner(x):
+        total = 0.0
+        for k in range(x.size):  # long enough to stay a function of its own
+            y = x[k]
+            for _ in range(power):
+                y = np.sin(y) * x[k] + np.cos(y) + np.exp(-y * y) + np.sqrt(y * y + 1.0) + np.log(y * y + 2.0)
+            total += y
+        return total
+    def outer(x):
+        return inner(x) + inner(x[1:]) + inner(x[2:]) + inner(x[::2].copy())
+    return inner, jit.kernel(outer)
+
+x = np.linspace(0.1, 2.0, 7)
+for power in map(int, sys.argv[1:]):
+    inner, outer = build(power)
+    by_hand = inner.py_func(x) + inner.py_func(x[1:]) + inner.py_func(x[2:]) + inner.py_func(x[::2].copy())
+    assert abs(outer(x) - by_hand) < 1e-9, (power, outer(x), by_hand)
+print(jit.compiled_count())
+"""
+
+
+def test_closures_of_one_factory_from_different_processes_keep_their_own_code(tmp_path: Path) -> None:
+    """numba names symbols by qualified name and a counter: two processes give the same one to different closures."""
+    root = Path(jit.__file__).parents[1]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(root)}
+    for powers, compiled in ((["1"], "1"), (["2"], "1"), (["1", "2"], "0"), (["2", "1"], "0")):
+        done = subprocess.run(
+            [sys.executable, "-c", _FACTORY, *powers], env=environment, capture_output=True, text=True, check=False
+        )
+        assert (done.returncode, done.stdout.strip()) == (0, compiled), done.stderr[-500:]
