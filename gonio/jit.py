@@ -39,8 +39,8 @@ def compiled_count() -> int:
 
 def model(function: Callable[..., Any]) -> Any:
     """Compile a scalar model function: IEEE order kept inside, inlined into the kernels that call it."""
-    _named(function, hashlib.sha256(repr(_fingerprint(function, set())).encode()).hexdigest())
-    return numba.njit(error_model="numpy", fastmath=False)(function)
+    key = hashlib.sha256(repr(_fingerprint(function, set())).encode()).hexdigest()
+    return numba.njit(error_model="numpy", fastmath=False)(_named(function, key))
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
@@ -62,7 +62,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     shown = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in options.items())
     text = repr([_FORMAT, numba.__version__, shown, _fingerprint(function, set())])
     key = hashlib.sha256(text.encode()).hexdigest()
-    _named(function, key)
+    function = _named(function, key)
     compiled = numba.njit(**options)(function)
     compiled._cache = _Cache(function, key, cache_folder())
     return compiled
@@ -74,14 +74,21 @@ def cache_folder() -> Path:
     return (Path(home) if home else Path.home() / ".cache") / "gonio"
 
 
-def _named(function: Callable[..., Any], key: str) -> None:
-    """Make the symbol of the machine code tell its content.
+def _named(function: Callable[..., Any], key: str) -> Callable[..., Any]:
+    """A copy of a function whose machine code will have a symbol that tells its content.
 
     numba names a symbol after the function's qualified name and a number counted in the process that compiled it. Closures
     of one factory, compiled by different processes and loaded from the cache into one, may so have the same symbol, and
     the linker would take the code of whichever came first for all of them.
     """
-    function.__qualname__ = f"{function.__qualname__}_{key[:24]}"
+    assert isinstance(function, types.FunctionType)
+    copy = types.FunctionType(
+        function.__code__, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__qualname__ = f"{function.__qualname__}_{key[:24]}"
+    copy.__module__ = function.__module__
+    copy.__kwdefaults__ = function.__kwdefaults__
+    return copy
 
 
 def _fingerprint(value: Any, seen: set[Any]) -> Any:

@@ -111,7 +111,10 @@ def _compile(function: Callable[..., Any]) -> Callable[..., float] | None:
     """The scalar function as a model function, 0 below the horizon; None if it cannot be compiled."""
     import numba
 
-    inner = jit.model(function)
+    try:
+        inner = jit.model(function)
+    except TypeError:
+        return None  # it leans on objects that the kernel cache cannot follow
 
     def above_horizon(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
         return float(inner(xi, yi, zi, xr, yr, zr)) if zi > 0.0 and zr > 0.0 else 0.0
@@ -121,7 +124,7 @@ def _compile(function: Callable[..., Any]) -> Callable[..., float] | None:
     try:
         _accumulate(model)(one, one, np.empty(0), 1.0, np.zeros(1))
     except (numba.errors.NumbaError, TypeError, NotImplementedError):
-        return None  # not in numba's language, or leaning on objects that the kernel cache cannot follow
+        return None  # not in numba's language
     return model  # type: ignore[no-any-return]
 
 

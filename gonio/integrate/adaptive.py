@@ -234,7 +234,7 @@ class _Block:
             mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
             feature.append(mirror[:, None, :])
             # across the plane of incidence the lobe is narrower by cos theta_r
-            widths.append(self.width * np.maximum(self.fixed[:, 2:3], 1e-4))
+            widths.append(self.width * np.maximum(self.fixed[:, 2:3], 0.02))
         if self.light is not None and self.light.peaks is not None and self.light.widths is not None:
             feature.append(self.light.peaks)
             widths.append(np.broadcast_to(self.light.widths, self.light.peaks.shape[:2]))

@@ -28,6 +28,7 @@ from gonio.integrate.grid import Gradients
 Array = NDArray[np.float64]
 Profile = Callable[[Array], tuple[Array, Array]]
 
+_NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no digits are left to agree
 _DEEPEST = 40  # halvings
 _FIRST, _GROWTH = 1.9, 4.4  # widths of a feature: the interval next to it, and how the others grow
 _RATE = 2.8  # the series of intervals graded so fall at least like this
@@ -137,7 +138,7 @@ def tabulate(
     bounds = _breaks(max(upper, 1e-3), features)
     pending = [(a, b, 0) for a, b in itertools.pairwise(bounds)]
     ready: list[tuple[float, float, Array, float]] = []
-    relative_error = 0.0
+    relative_error = top = 0.0
     while pending:
         a, b = (np.array([piece[k] for piece in pending])[:, None] for k in (0, 1))
         value, sampled = (v.reshape(len(pending), -1) for v in profile((a + 0.5 * (b - a) * (places + 1.0)).ravel()))
@@ -145,7 +146,8 @@ def tabulate(
         missed = np.max(np.abs(series @ at_probes.T - value[:, degree + 1 :]), axis=1)
         worst, least = np.max(sampled, axis=1), np.min(np.abs(value), axis=1)
         interpolation = np.maximum(2.0 * missed, 0.5 * np.sum(np.abs(series[:, -2:]), axis=1))
-        allowed = np.maximum(np.maximum(rtol * least, atol) - lebesgue * worst, 0.0)
+        top = max(top, float(np.max(np.abs(value))))
+        allowed = np.maximum(np.maximum(rtol * least, atol) - lebesgue * worst, _NOTHING * top)
         # where the samples themselves fall short, halving can't help
         relative = np.max(sampled / np.maximum(np.abs(value), atol / rtol + 1e-300), axis=1)
         allowed = np.where(lebesgue * relative > 0.9 * rtol, np.maximum(allowed, 2.0 * worst), allowed)
