@@ -1,0 +1,14 @@
+"""What all tests share: signals as a terminal has them.
+
+A runner that is started in the background or by nohup ignores SIGINT or SIGHUP, and gonio rightly leaves ignored signals
+ignored; the tests of its handlers need the ordinary ones.
+"""
+
+from __future__ import annotations
+
+import signal
+
+for _name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    _number = getattr(signal, _name, None)
+    if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, signal.default_int_handler if _name == "SIGINT" else signal.SIG_DFL)
