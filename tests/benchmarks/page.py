@@ -218,7 +218,7 @@ def verdicts(
     cold = f"{seconds(began.cold)} ({seconds(began.cold_processor)} of processor)"
     judge("cold start of `gonio map`", "1.5 s", cold, began.cold <= 1.5)
     judge("first ever run, and says that it compiles", "20 s", seconds(began.first), began.first <= 20.0 and began.says_so)
-    lies = [f"{r.scene.name} at {x.setting}" for r in results for x in r.runs if x.remark == "understated"]
+    lies = dict.fromkeys(r.scene.name for r in results for x in r.runs if x.remark == "understated")
     judge("errors understated", "none", ", ".join(lies) or "none", not lies)
     return table(["promise", "limit", "measured", ""], rows)
 
@@ -228,7 +228,7 @@ def _ratio(result: Result, time: Time, n: int) -> tuple[float, str, str]:
     own = result.fastest("gonio", time.target.rtol)
     ratio, name = result.ratio(time.target.rtol, (BY_HAND,))
     if own is None or math.isnan(ratio):
-        return 0.0, result.scene.name, name
+        return 0.0, result.scene.name, "gonio does not get there"
     if n == 256:  # a peer's time grows with the number of gradients
         ratio *= 16.0 * own.seconds / time.seconds
     return ratio, result.scene.name, name or "more than all peers tried"
