@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import importlib.util
 import math
 import os
 import platform
@@ -52,7 +53,8 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     if info.exists():
         name = next((l.split(":", 1)[1].strip() for l in info.read_text().splitlines() if l.startswith("model name")), name)
-    packages = ", ".join(f"{p} {version(p)}" for p in ("numpy", "scipy", "numba"))
+    known = ("numpy", "scipy", "numba", "mitsuba")
+    packages = ", ".join(f"{p} {version(p)}" for p in known if importlib.util.find_spec(p) is not None)
     load = f"; load average at the start {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     return f"{name}, {CORES} cores, Python {platform.python_version()}, {packages}, {today}{load}."
