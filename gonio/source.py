@@ -299,11 +299,6 @@ _KINDS: dict[str, Callable[..., Source]] = {
 }  # fmt: skip
 
 
-def kinds() -> dict[str, Callable[..., Source]]:
-    """All source kinds by name."""
-    return dict(_KINDS)
-
-
 def make(kind: str, **parameters: object) -> Source:
     """A source by name; see the function of that name for its parameters.
 

@@ -245,16 +245,6 @@ class Run:
         return self.path / "posterior.nc"
 
     @property
-    def map_path(self) -> Path:
-        """The reflectance map."""
-        return self.path / "map.nc"
-
-    @property
-    def report_path(self) -> Path:
-        """The report."""
-        return self.path / "report.html"
-
-    @property
     def log_path(self) -> Path:
         """The log."""
         return self.path / "gonio.log"
