@@ -15,7 +15,7 @@ from __future__ import annotations
 import difflib
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -240,6 +240,10 @@ class BRDF:
         wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
         flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
         out = np.zeros(len(flat_i))
+        fused = accumulate_sum(self.terms)
+        if fused is not None:
+            fused[0](flat_i, flat_r, fused[1], 1.0, out)
+            return out.reshape(wi.shape[:-1])
         for term in self.terms:
             accumulate(term.model)(flat_i, flat_r, term.values, term.weight, out)
         return out.reshape(wi.shape[:-1])
@@ -259,12 +263,43 @@ def accumulate(model: Model) -> Any:
 @functools.cache
 def _accumulate(function: Callable[..., float]) -> Any:
     def accumulate_terms(omega_i, omega_r, p, weight, out):  # type: ignore[no-untyped-def]
+        i, r = omega_i.ravel(), omega_r.ravel()  # with one index the loop vectorises
         for k in range(out.size):
-            out[k] += weight * function(
-                omega_i[k, 0], omega_i[k, 1], omega_i[k, 2], omega_r[k, 0], omega_r[k, 1], omega_r[k, 2], p
-            )
+            out[k] += weight * function(i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2], p)
 
     return jit.kernel(accumulate_terms)
+
+
+def accumulate_sum(terms: Sequence[Term]) -> tuple[Any, Array] | None:
+    """Kernel as of `accumulate`, and parameter array, of several compiled terms in one pass; None if they are not."""
+    functions = tuple(term.model.function for term in terms)
+    if len(functions) < 2 or None in functions:
+        return None
+    packed = np.array([x for term in terms for x in (term.weight, *term.values)])
+    return _accumulate(_weighted_sum(functions, tuple(1 + len(term.values) for term in terms))), packed
+
+
+@functools.cache
+def _weighted_sum(functions: tuple[Any, ...], sizes: tuple[int, ...]) -> Any:
+    """Scalar function of a sum of terms; its parameter array holds, term after term, weight and parameters."""
+    total, start = None, 0
+    for function, size in zip(functions, sizes, strict=True):
+        total, start = _joined(total, function, start), start + size
+    return total
+
+
+def _joined(before: Any, function: Callable[..., float], start: int) -> Any:
+    if before is None:
+
+        def first(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+            return p[start] * function(xi, yi, zi, xr, yr, zr, p[start + 1 :])
+
+        return jit.model(first)
+
+    def both(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+        return before(xi, yi, zi, xr, yr, zr, p) + p[start] * function(xi, yi, zi, xr, yr, zr, p[start + 1 :])
+
+    return jit.model(both)
 
 
 def _accumulate_array(

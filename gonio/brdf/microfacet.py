@@ -33,7 +33,7 @@ INV_PI = 1.0 / math.pi
 @jit.model
 def ggx_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
     k_s, alpha, f_0 = p[0], p[1], p[2]
-    lit = zi > 0.0 and zr > 0.0
+    lit = (zi > 0.0) & (zr > 0.0)  # no branch: the loop vectorises
     mu_i = zi if lit else 1.0
     mu_r = zr if lit else 1.0
     a2 = alpha * alpha
@@ -46,7 +46,7 @@ def ggx_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p:
     si2, sr2 = xi * xi + yi * yi, xr * xr + yr * yr
     g = 0.5 / (mu_r * math.sqrt(mu_i * mu_i + a2 * si2) + mu_i * math.sqrt(mu_r * mu_r + a2 * sr2))
     c = 1.0 - 0.5 * math.sqrt(l2)  # 1 - h.v, as h.v = |wi + wr| / 2
-    c = max(0.0, c)
+    c = c if c > 0.0 else 0.0
     c2 = c * c
     f = f_0 + (1.0 - f_0) * c2 * c2 * c
     return k_s * f * d * g if lit else 0.0
