@@ -126,11 +126,11 @@ _directions_kernel, _moments_kernel, _reduce_kernel = jit.kernel(_directions), j
 
 @functools.cache
 def _term_kernel(function: Callable[..., float]) -> Any:
-    """Add one model's f_r: directions (w or 1, v, 6, n), full (w, all) from column `first` on, out (w, v, n)."""
+    """Add one model's f_r: directions (w or 1, v, 6, n), parameters (w, k), out (w, v, n)."""
 
-    def accumulate_walkers(directions, full, first, count, out):  # type: ignore[no-untyped-def]
+    def accumulate_walkers(directions, parameters, out):  # type: ignore[no-untyped-def]
         for w in range(out.shape[0]):
-            p = full[w, first : first + count]
+            p = parameters[w]
             for v in range(out.shape[1]):
                 d = directions[w if directions.shape[0] > 1 else 0, v]
                 xi, yi, zi, xr, yr, zr, to = d[0], d[1], d[2], d[3], d[4], d[5], out[w, v]
@@ -224,11 +224,7 @@ class Problem:
         if not self.model_names:
             raise ParameterError("every parameter of the model is fixed; free at least one")
         starts = np.cumsum([0, *(len(m.parameters) for m in self.models)])
-        self._terms = [
-            (_term_kernel(m.function), int(a), len(m.parameters))
-            for m, a in zip(self.models, starts, strict=False)
-            if m.function is not None
-        ]
+        self._terms = [(m, int(a)) for m, a in zip(self.models, starts, strict=False) if m.function is not None]
         self._offset, self._noise = len(own), len(own) + len(errors)
         self._geometry(errors)
 
@@ -273,8 +269,11 @@ class Problem:
             directions = np.empty((shape[0], shape[1], 6, shape[2]))
             _directions_kernel(base, slope, full, self._offset, self._varied, STEP, directions)
         values = np.zeros(shape)
-        for kernel, first, count in self._terms:
-            kernel(directions, full, first, count, values)
+        for model, first in self._terms:
+            parameters = np.ascontiguousarray(full[:, first : first + len(model.parameters)])
+            if model.derived is not None:
+                parameters = np.array([model.complete(row) for row in parameters])
+            _term_kernel(model.function)(directions, parameters, values)
         mean, var = np.empty((shape[0], shape[2])), np.empty((shape[0], shape[2]))
         _moments_kernel(
             values, full, self._offset, self._noise, log_slope, self._has_log, self._noisy, self._variant,

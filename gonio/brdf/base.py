@@ -16,7 +16,7 @@ import difflib
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,8 @@ class Parameter:
         Default prior of a fit: ``("uniform", lower, upper)`` or ``("log_normal", mean of ln, sd of ln)``, cut to the range.
     fixed : float, optional
         Value at which a fit holds the parameter unless it is freed.
+    default : float, optional
+        Value where none is given; without it the parameter must be given.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Parameter:
     prior: tuple[str, float, float]
     unit: str = "1"
     fixed: float | None = None
+    default: float | None = None
 
     def check(self, value: float, owner: str) -> float:
         """The value as float, or a `ParameterError` naming what is allowed."""
@@ -71,7 +74,7 @@ class Model:
     ----------
     name, doc, reference : str
     parameters : tuple of Parameter
-        In the order of the parameter array.
+        In the order of the parameter array, whose first numbers they are.
     function : callable
         ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function and for
         a function that is not compiled.
@@ -81,11 +84,19 @@ class Model:
     kinks : callable, optional
         ``(p, omega_r (3,)) -> (k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which f_r or a
         derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels there.
+    features : callable, optional
+        ``(p, omega_r (3,)) -> (k, 4)``: narrow structures elsewhere than at the mirror direction, as a function of omega_i
+        for the given omega_r: rows of a unit vector and a half width [rad], such as an opposition peak's.
+    derived : callable, optional
+        Of the parameters (n,): numbers (m,) that depend on them only and that the function finds behind them in the
+        parameter array, such as a table of albedos.
     array_function : callable, optional
         ``(omega_i (n, 3), omega_r (n, 3), p) -> (n,)`` for code that is not compiled; `function` is then None.
     diffuse : bool
         f_r is the same for all pairs of directions (Lambert).
     isotropic, reciprocal, energy_bounded : bool
+    choices : mapping of str to str
+        What tells this model from others of its name and is not the default: ``{"variant": "full"}``.
     own : bool
         A user's function: errors of its integrals are estimates.
     """
@@ -97,12 +108,21 @@ class Model:
     reference: str
     lobe_width: Callable[[Array], float] | None = None
     kinks: Callable[[Array, Array], Array] | None = None
+    features: Callable[[Array, Array], Array] | None = None
+    derived: Callable[[Array], Array] | None = None
     array_function: Callable[[Array, Array, Array], Array] | None = None
     diffuse: bool = False
     isotropic: bool = True
     reciprocal: bool = True
     energy_bounded: bool = True
+    choices: Mapping[str, str] = field(default_factory=dict)
     own: bool = False
+
+    @property
+    def expression(self) -> str:
+        """Name and choices, as `gonio.brdf.parse` reads them: ``"oren_nayar[variant=full]"``."""
+        chosen = ",".join(f"{key}={value}" for key, value in self.choices.items())
+        return f"{self.name}[{chosen}]" if chosen else self.name
 
     @property
     def delta(self) -> bool:
@@ -110,17 +130,22 @@ class Model:
         return self.function is None and self.array_function is None
 
     def values(self, given: Mapping[str, float]) -> Array:
-        """Parameter array from named values; every parameter must be given, and no other."""
+        """Parameter array from named values: all that have no default, and no others."""
         names = [parameter.name for parameter in self.parameters]
         for name in given:
             if name not in names:
                 raise ParameterError(
                     f"{self.name} has no parameter {name!r}{_suggest(name, names)}; it has: {', '.join(names)}"
                 )
+        given = {p.name: p.default for p in self.parameters if p.default is not None} | dict(given)
         missing = [name for name in names if name not in given]
         if missing:
             raise ParameterError(f"{self.name} needs {', '.join(missing)} as well; its parameters are: {', '.join(names)}")
-        return np.array([parameter.check(given[parameter.name], self.name) for parameter in self.parameters])
+        return self.complete(np.array([parameter.check(given[parameter.name], self.name) for parameter in self.parameters]))
+
+    def complete(self, parameters: Array) -> Array:
+        """The parameter array: the parameters (n,) and what is derived from them."""
+        return parameters if self.derived is None else np.concatenate((parameters, self.derived(parameters)))
 
 
 @dataclass(frozen=True)
@@ -137,10 +162,15 @@ class Term:
 
     @property
     def plain(self) -> bool:
-        """Compiled, isotropic, without kinks and not a user's: what a rule for smooth integrands may take."""
+        """Compiled, isotropic, no user's, without kinks and features: what a rule for smooth integrands may take."""
         model = self.model
-        smooth = len(self.kinks(np.array([0.6, 0.0, 0.8]))) == 0
+        slanted = np.array([0.6, 0.0, 0.8])
+        smooth = len(self.kinks(slanted)) == 0 and len(self.features(slanted)) == 0
         return smooth and model.function is not None and model.isotropic and not model.own
+
+    def features(self, omega_r: Array) -> Array:
+        """Narrow structures elsewhere than at the mirror: rows of a unit vector and a half width [rad], shape (k, 4)."""
+        return np.empty((0, 4)) if self.model.features is None else self.model.features(self.values, omega_r)
 
     def kinks(self, omega_r: Array) -> Array:
         """Planes ``c . w = d`` of the term's kinks for a reflected direction (3,), shape (k, 4); k = 0 without any."""
@@ -181,13 +211,14 @@ class BRDF:
         shown = []
         for name, term in zip(term_names(t.model for t in self.terms), self.terms, strict=True):
             pairs = ", ".join(f"{p.name}={v:.6g}" for p, v in zip(term.model.parameters, term.values, strict=False))
+            pairs = ", ".join([pairs, *(f'{key}="{value}"' for key, value in term.model.choices.items())])
             shown.append(("" if term.weight == 1.0 else f"{term.weight:g} * ") + f"{name}({pairs})")
         return " + ".join(shown)
 
     @property
     def name(self) -> str:
-        """Names of the models joined by ``+``."""
-        return "+".join(term.model.name for term in self.terms)
+        """Names of the models, with their choices, joined by ``+``."""
+        return "+".join(term.model.expression for term in self.terms)
 
     def parameters(self) -> dict[str, float]:
         """Qualified parameter values, such as ``{"ggx.alpha": 0.3}``."""

@@ -15,7 +15,7 @@ def models(name: str | None, as_json: bool) -> None:
     from gonio import brdf
 
     with speaking(as_json) as output:
-        chosen = [brdf.find(name)] if name else list(brdf.models().values())
+        chosen = [brdf.parse(name)[0]] if name else list(brdf.models().values())
         for model in chosen:
             output.say(f"{model.name}: {model.doc}")
             for parameter in model.parameters:
