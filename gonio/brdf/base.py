@@ -82,8 +82,9 @@ class Model:
         Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
         angle; the integrator lays its nodes by it. None: no lobe.
     kinks : callable, optional
-        ``(p, omega_r (3,)) -> (k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which f_r or a
-        derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels there.
+        ``(p, omega_r (..., 3)) -> (..., k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which
+        f_r or a derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels
+        there. A plane that one omega_r does not have is out of reach: d = 2. A user's own function takes one omega_r.
     features : callable, optional
         ``(p, omega_r (3,)) -> (k, 4)``: narrow structures elsewhere than at the mirror direction, as a function of omega_i
         for the given omega_r: rows of a unit vector and a half width [rad], such as an opposition peak's.
@@ -173,8 +174,13 @@ class Term:
         return np.empty((0, 4)) if self.model.features is None else self.model.features(self.values, omega_r)
 
     def kinks(self, omega_r: Array) -> Array:
-        """Planes ``c . w = d`` of the term's kinks for a reflected direction (3,), shape (k, 4); k = 0 without any."""
-        return np.empty((0, 4)) if self.model.kinks is None else self.model.kinks(self.values, omega_r)
+        """Planes ``c . w = d`` of the term's kinks for reflected directions (..., 3), shape (..., k, 4); k = 0 without any.
+
+        Of a user's own function: for one direction (3,).
+        """
+        if self.model.kinks is None:
+            return np.empty((*omega_r.shape[:-1], 0, 4))
+        return self.model.kinks(self.values, omega_r)
 
 
 class BRDF:

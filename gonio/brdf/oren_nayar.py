@@ -43,11 +43,16 @@ def qualitative_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: f
 
 def _kinks(p: Array, omega_r: Array) -> Array:
     """Where alpha and beta change places, theta_i = theta_r, and where cos dphi changes sign."""
-    x, y, z = omega_r
-    across = math.hypot(x, y)
-    if p[1] == 0.0 or across == 0.0:  # Lambert; or seen from straight above, where s = 0
-        return np.empty((0, 4))
-    return np.array([[0.0, 0.0, 1.0, z], [x / across, y / across, 0.0, 0.0]])
+    if p[1] == 0.0:  # Lambert
+        return np.empty((*omega_r.shape[:-1], 0, 4))
+    across = np.hypot(omega_r[..., 0], omega_r[..., 1])
+    slanted = across > 0.0  # seen from straight above, s = 0
+    planes = np.zeros((*across.shape, 2, 4))
+    planes[..., 0, 2], planes[..., 0, 3] = 1.0, np.where(slanted, omega_r[..., 2], 2.0)
+    planes[..., 1, 0] = np.divide(omega_r[..., 0], across, out=np.ones_like(across), where=slanted)
+    planes[..., 1, 1] = np.divide(omega_r[..., 1], across, out=np.zeros_like(across), where=slanted)
+    planes[..., 1, 3] = np.where(slanted, 0.0, 2.0)
+    return planes
 
 
 OREN_NAYAR = Model(

@@ -57,8 +57,9 @@ def _width(p: Array) -> float:
 def _kinks(p: Array, omega_r: Array) -> Array:
     """The lobe is cut at m.w = 0, with a derivative that jumps where n is small."""
     if p[1] >= _SMOOTH:
-        return np.empty((0, 4))
-    return np.array([[-omega_r[0], -omega_r[1], omega_r[2], 0.0]])
+        return np.empty((*omega_r.shape[:-1], 0, 4))
+    plane = np.stack((-omega_r[..., 0], -omega_r[..., 1], omega_r[..., 2], np.zeros_like(omega_r[..., 2])), axis=-1)
+    return plane[..., None, :]
 
 
 PHONG = Model(
