@@ -8,8 +8,8 @@ all gradients; one compiled loop per model climbs from rule to rule until two ag
 A disk that the horizon cuts is, seen from its centre in gnomonic projection, a segment of a circle: points
 :math:`\rho(\cos\psi, s\sin\psi)` with psi from 0 to the horizon and s in [-1, 1], without a singularity.
 
-Gradients for which no rule is fine enough are left to `gonio.integrate.quadrature`: a rule that could miss a lobe is never
-asked.
+Disks that a kink of the BRDF cuts go to `gonio.integrate.cut_disk`. Gradients for which no rule is fine enough are left to
+`gonio.integrate.quadrature`: a rule that could miss a lobe is never asked.
 
 References
 ----------
@@ -27,18 +27,21 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf.base import Term
+from gonio.integrate import cut_disk
 from gonio.integrate.cap import unit_rule
+from gonio.integrate.cut_disk import crosses
 from gonio.integrate.grid import Gradients, cosines
 from gonio.source import Cap
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
 LARGEST = 0.35  # half angle [rad]
-_RULES = ((1, 4), (2, 6), (2, 8), (4, 16), (6, 24), (9, 36))  # nodes along the radius, around the centre
-_DEGREES = (3, 5, 7, 15, 23, 35)
+_RULES = ((1, 4), (2, 6), (3, 8), (4, 16), (6, 24), (9, 36), (13, 52))  # nodes along the radius, around the centre
+_DEGREES = (3, 5, 7, 15, 23, 35, 51)
 _CUT = (6, 9, 13, 19, 27)  # nodes along either coordinate of a segment
 _FINER = 0.5  # least distance of a lobe or a horizon's layer, in half angles
 _BLOCK = 256  # gradients whose sums advance together
+_NOTHING = 1e-60  # of the solid angle: the far tail of a lobe, of which no digits are asked
 
 
 @functools.cache
@@ -60,8 +63,9 @@ def _nodes(half_angle: float) -> tuple[Array, NDArray[np.int64]]:
 
 def suits(term: Term, cap: Cap) -> bool:
     """Whether `add` can do most gradients."""
-    model = term.model
-    return cap.half_angle <= LARGEST and cap.profile is None and term.plain and not model.own
+    model, slanted = term.model, np.array([0.6, 0.0, 0.8])
+    smooth = model.function is not None and model.isotropic and not model.own and len(term.features(slanted)) == 0
+    return cap.half_angle <= LARGEST and cap.profile is None and smooth
 
 
 def add(
@@ -82,14 +86,23 @@ def add(
     """
     nodes, starts = _nodes(cap.half_angle)
     x, w, cuts = _segment_nodes()
-    left = np.empty(tile[1] - tile[0], dtype=np.int64)
-    counts = np.zeros(2, dtype=np.int64)
+    left, crossed = np.empty((2, tile[1] - tile[0]), dtype=np.int64)
+    counts = np.zeros(3, dtype=np.int64)
+    kinked = term.model.kinks is not None
+    planes = term.kinks(gradients.elements(*tile).viewer()) if kinked else np.empty((0, 0, 4))
+    floor = _NOTHING * math.pi * math.sin(cap.half_angle) ** 2
     worst = _kernel(term.model.function)(
         gradients.p, gradients.q, *tile, np.array(cap.axis), cap.half_angle, cap.radiance * term.weight,
         term.lobe_width() or 10.0, term.values, nodes, starts, np.array(_DEGREES, dtype=float),
-        x, w, cuts, rtol, value, error, left, counts,
+        x, w, cuts, planes, rtol, floor, value, error, left, crossed, counts,
     )  # fmt: skip
-    return float(worst), int(counts[1]), left[: counts[0]].astype(np.intp)
+    rest, nodes_used = left[: counts[0]].astype(np.intp), int(counts[1])
+    if counts[2]:
+        some = crossed[: counts[2]]
+        at_cuts, more, missed = cut_disk.add(term, cap, gradients, some, planes[some - tile[0]], rtol, floor, value, error)
+        rest = np.sort(np.concatenate((rest, missed)))
+        worst, nodes_used = max(worst, at_cuts), nodes_used + more
+    return float(worst), nodes_used, rest
 
 
 @functools.cache
@@ -115,7 +128,9 @@ def tangents(ax, ay, az):  # type: ignore[no-untyped-def]
 @functools.cache
 def _kernel(function: Any) -> Any:
     @jit.model
-    def segment(ax, ay, az, s, c, half_angle, layer, parameters, x, w, cuts, rtol, counts):  # type: ignore[no-untyped-def]
+    def segment(  # type: ignore[no-untyped-def]
+        ax, ay, az, s, c, half_angle, layer, parameters, x, w, cuts, rtol, floor, counts
+    ):
         """Integral over a disk that the horizon cuts; negative if the rules don't agree."""
         # e points up the disk, away from the horizon; f along it
         up = math.sqrt(1.0 - az * az)
@@ -154,18 +169,18 @@ def _kernel(function: Any) -> Any:
                 estimate = 2.0 * step
                 if earlier >= 0.0:
                     estimate = max(step, 0.01 * abs(before - earlier))
-                if total > 0.0 and estimate <= 0.25 * rtol * total:
+                if estimate <= max(0.25 * rtol * total, floor):
                     return total
             earlier, before = before, total
         return -1.0
 
     def disks(  # type: ignore[no-untyped-def]
-        p, q, start, stop, axis, half_angle, scale, width, parameters, nodes, starts, degrees, x, w, cuts, rtol,
-        value, error, left, counts,
+        p, q, start, stop, axis, half_angle, scale, width, parameters, nodes, starts, degrees, x, w, cuts, planes, rtol,
+        floor, value, error, left, crossed, counts,
     ):  # fmt: skip
-        columns, worst, rules = p.shape[1], 0.0, degrees.size
+        columns, worst, rules, kinks = p.shape[1], 0.0, degrees.size, planes.shape[1]
         dx, dy, dz = axis[0], axis[1], axis[2]
-        sine = math.sin(half_angle)
+        sine, cosine = math.sin(half_angle), math.cos(half_angle)
         g, now = np.empty((11, _BLOCK)), np.empty((11, _BLOCK))  # axis and tangents in the local frame, sin, cos theta_n
         sums, chosen = np.empty(_BLOCK), np.empty(_BLOCK, dtype=np.int64)
         level, history = np.empty(_BLOCK, dtype=np.int64), np.empty((2, _BLOCK))
@@ -184,12 +199,24 @@ def _kernel(function: Any) -> Any:
                 lobe = (ax - s) ** 2 + ay * ay + (az - c) ** 2 + (2.0 * width * c) ** 2
                 layer = min(width, c)
                 if width >= 10.0:
-                    lobe, layer = 1.0, 1.0
+                    lobe, layer = 1.0, c if kinks else 1.0
                 far = math.sqrt(min(lobe, 1.0)) * _FINER / half_angle
+                cut = False
+                for j in range(kinks):
+                    row = planes[block + k - start, j]
+                    cut = cut or crosses(row[0], row[1], row[2], row[3], ax, ay, az, sine, cosine)
+                if cut and far > 1.0:
+                    crossed[counts[2]] = block + k
+                    counts[2] += 1
+                    continue
+                if cut:
+                    left[counts[0]] = block + k
+                    counts[0] += 1
+                    continue
                 if az <= sine:
                     total = -1.0
                     if far > 1.0 and layer > 0.02 * half_angle and az > -0.99999 * sine:
-                        total = segment(ax, ay, az, s, c, half_angle, layer, parameters, x, w, cuts, rtol, counts)
+                        total = segment(ax, ay, az, s, c, half_angle, layer, parameters, x, w, cuts, rtol, floor, counts)
                     if total < 0.0:
                         left[counts[0]] = block + k
                         counts[0] += 1
@@ -197,7 +224,7 @@ def _kernel(function: Any) -> Any:
                         height = min(az + sine, sine)
                         relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 16.0 / height)
                         value[block + k] += scale * total
-                        error[block + k] += scale * relative * total
+                        error[block + k] += scale * max(relative * total, floor)
                         worst = max(worst, relative)
                     continue
                 far = math.sqrt(min(lobe, az * az + layer * layer)) * _FINER / half_angle
@@ -241,10 +268,10 @@ def _kernel(function: Any) -> Any:
                         step = abs(total - before)
                         estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
                     history[0, k], history[1, k] = total, before
-                    if total > 0.0 and estimate <= 0.25 * rtol * total:
+                    if estimate <= max(0.25 * rtol * total, floor):
                         relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 4.0 / g[2, k])
                         value[block + k] += scale * total
-                        error[block + k] += scale * relative * total
+                        error[block + k] += scale * max(relative * total, floor)
                         worst = max(worst, relative)
                         level[k] = rules
                     elif rule == rules - 1:
