@@ -1,7 +1,7 @@
-"""Environment maps from image files: Radiance HDR, floating-point TIFF, NPY.
+"""Environment maps from image files: Radiance HDR, floating-point TIFF, NPY, and OpenEXR where its package is installed.
 
 Row 0 is next to the viewer's axis (theta = 0), column 0 next to phi = 0. Images for display (8 or 16 bit integers) are
-refused, as their values are no radiance; so are pickled arrays. OpenEXR is not read: save as HDR or floating-point TIFF.
+refused, as their values are no radiance; so are pickled arrays, and EXR files of several parts.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def read(path: str | os.PathLike[str], channel: str = "luminance") -> Array:
     Parameters
     ----------
     path : path
-        ``.hdr``, ``.pic``, ``.tif``, ``.tiff`` or ``.npy``.
+        ``.hdr``, ``.pic``, ``.tif``, ``.tiff``, ``.npy`` or, with the extra ``exr``, ``.exr``.
     channel : {"luminance", "red", "green", "blue"}
         What a colour image gives: 0.2126 R + 0.7152 G + 0.0722 B, or one colour.
 
@@ -55,9 +55,9 @@ def read(path: str | os.PathLike[str], channel: str = "luminance") -> Array:
     elif suffix in (".hdr", ".pic", ".tif", ".tiff"):
         image = _image(file)
     elif suffix == ".exr":
-        raise DatasetError(f"{file}: OpenEXR is not read; save it as Radiance HDR, floating-point TIFF or NPY")
+        image = _exr(file)
     else:
-        raise DatasetError(f"{file}: {suffix or 'no suffix'} is not known; give .hdr, .tif, .tiff or .npy")
+        raise DatasetError(f"{file}: {suffix or 'no suffix'} is not known; give .hdr, .tif, .tiff, .npy or .exr")
     _check_shape(file, image.shape)
     if image.ndim == 3 and image.shape[2] >= 3:
         colours = image[..., :3].astype(float)
@@ -102,3 +102,35 @@ def _image(file: Path) -> NDArray[np.generic]:
     if image.ndim == 3 and image.shape[2] >= 3:
         image = image[..., 2::-1]  # OpenCV's order is blue, green, red
     return np.asarray(image)
+
+
+def _exr(file: Path) -> NDArray[np.generic]:
+    """R, G, B, or the luminance Y, or the only channel there is."""
+    try:
+        import OpenEXR  # type: ignore[import-not-found,unused-ignore]
+    except ImportError:
+        raise DatasetError(
+            f"{file}: reading OpenEXR needs the package OpenEXR (gonio's extra exr): pip install OpenEXR, or save the image "
+            "as Radiance HDR, floating-point TIFF or NPY"
+        ) from None
+    try:
+        window = OpenEXR.File(str(file), header_only=True).header()["dataWindow"]  # sizes are known before pixels
+        width, height = (int(b) - int(a) + 1 for a, b in zip(*window, strict=True))
+        _check_shape(file, (height, width))
+        channels = OpenEXR.File(str(file), separate_channels=True).channels()
+        planes = {str(name): np.asarray(channel.pixels) for name, channel in channels.items()}
+    except DatasetError:
+        raise
+    except Exception as exc:
+        raise DatasetError(f"{file} is no OpenEXR image that can be read ({str(exc)[:150]}); save it again") from exc
+    if {"R", "G", "B"} <= planes.keys():
+        chosen = [planes[name] for name in "RGB"]
+    elif "Y" in planes or len(planes) == 1:
+        chosen = [planes["Y"] if "Y" in planes else next(iter(planes.values()))]
+    else:
+        raise DatasetError(
+            f"{file} has the channels {', '.join(planes) or 'none'}; radiance is R, G, B, or Y, or one channel"
+        )
+    if any(plane.shape != (height, width) or plane.dtype.kind != "f" for plane in chosen):
+        raise DatasetError(f"{file} has subsampled channels or integers; save it with floating-point R, G, B in full size")
+    return np.stack(chosen, axis=-1)

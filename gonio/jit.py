@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+import time
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,7 @@ FAST = {"reassoc", "nsz", "contract", "arcp"}
 _PURE = ("math", "numpy", "numba", "builtins")
 _FORMAT = 2  # of what is kept; a new number discards the old files
 _compiled = 0  # kernels compiled, not loaded, by this process
+_seconds = 0.0  # spent on loading and compiling them
 
 
 def compiled_count() -> int:
@@ -37,10 +39,20 @@ def compiled_count() -> int:
     return _compiled
 
 
+def getting_ready_s() -> float:
+    """Seconds that this process has spent on loading kernels from the cache and compiling them."""
+    return _seconds
+
+
 def model(function: Callable[..., Any]) -> Any:
-    """Compile a scalar model function: IEEE order kept inside, inlined into the kernels that call it."""
+    """Compile a scalar model function: IEEE order kept inside; inlined into the loops that call it, which so vectorise."""
+    return part(function, forceinline=True)
+
+
+def part(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile a function that kernels call, inlined where the compiler finds it worthwhile; options of ``numba.njit``."""
     key = hashlib.sha256(repr(_fingerprint(function, set())).encode()).hexdigest()
-    return numba.njit(error_model="numpy", fastmath=False)(_named(function, key))
+    return numba.njit(error_model="numpy", fastmath=False, **options)(_named(function, key))
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
@@ -49,7 +61,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     Parameters
     ----------
     function : callable
-        May close over functions compiled by `model`, numbers, strings, tuples and arrays.
+        May close over functions compiled by `model` and `part`, numbers, strings, tuples and arrays.
     **options
         Passed to ``numba.njit``.
 
@@ -137,16 +149,21 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         return sig, codegen.magic_tuple(), self._key
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        global _compiled
+        global _compiled, _seconds
+        self._since = time.perf_counter()
         try:
             loaded = super().load_overload(sig, target_context)
         except Exception:  # noqa: BLE001  whatever a damaged file raises: compile again
             loaded = None
         if loaded is None:
             _compiled += 1
+        else:
+            _seconds += time.perf_counter() - self._since
         return loaded
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        global _seconds
+        _seconds += time.perf_counter() - self._since
         for _ in range(2):
             try:
                 super().save_overload(sig, data)

@@ -9,8 +9,7 @@ import click
 
 from gonio.cli import steps
 from gonio.cli.output import Output, json_option, speaking
-from gonio.errors import ParameterError
-from gonio.integrate.plan import Step
+from gonio.errors import ConfigurationError, DatasetError, ParameterError
 
 if TYPE_CHECKING:
     from gonio.maps import ReflectanceMap
@@ -18,7 +17,13 @@ if TYPE_CHECKING:
 
 @click.command("map")
 @click.argument("scene", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="NetCDF file to write.")
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="NetCDF file to write; else the scene's [output] map."
+)
+@click.option(
+    "--plot", type=click.Path(path_type=Path, dir_okay=False),
+    help="Picture to write, .png: contours in gradient space; else the scene's [output] plot.",
+)  # fmt: skip
 @click.option("--explain", is_flag=True, help="Print what was computed how, what was skipped, and what it took.")
 @click.option(
     "--render", type=click.Path(path_type=Path, dir_okay=False), metavar="HEIGHTS",
@@ -26,37 +31,77 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--spacing", metavar="DX[,DY]", help="Distance of HEIGHTS' columns and rows; DY < 0 if rows run downwards.")
 @json_option
-def map_(scene: Path, out: Path, explain: bool, render: Path | None, spacing: str | None, as_json: bool) -> None:
-    """Compute R(p, q) of SCENE (scene.toml): the radiance seen by a viewer at +z against the surface's gradient."""
+def map_(
+    scene: Path, out: Path | None, plot: Path | None, explain: bool, render: Path | None, spacing: str | None, as_json: bool
+) -> None:
+    """Compute R(p, q) of SCENE (scene.toml): the radiance that a viewer sees against the surface's gradient."""
     import numpy as np
 
     from gonio import jit
     from gonio.config import load_scene
+    from gonio.fields import EnvironmentMap, Harmonics
 
     with speaking(as_json) as output:
         step = _spacing(spacing, render)
         config = load_scene(scene)
+        out, plot = out or config.map, plot or config.plot
+        if out is None:
+            raise ConfigurationError(f'{scene}: no file to write; give --out MAP.nc, or map = "..." under [output]')
+        if plot is not None and plot.suffix.lower() != ".png":
+            raise ParameterError(f"--plot {plot}: the picture is a PNG; give a name that ends in .png")
+        for target in (out, plot):
+            if target is not None:
+                _make_folder(target)
         brdf, posterior, origin = steps.scene_brdf(config, scene.parent)
         source = steps.scene_source(config)
+        slow = sorted({part.kind for part in source.parts if isinstance(part, EnvironmentMap | Harmonics)})
+        if config.viewer is not None and slow:
+            output.warn(
+                f"{scene}: with the viewer off axis, {' and '.join(slow)} cost up to a second for each of the "
+                f"{config.n[0] * config.n[1]} gradients; a smaller [grid] n or a larger rtol shortens it"
+            )
         made, values = steps.compute_map(
             output, "reflectance map", brdf, source,
-            np.linspace(*config.p, config.n), np.linspace(*config.q, config.n),
-            rtol=config.rtol, posterior=posterior, attributes=origin,
+            np.linspace(*config.p, config.n[0]), np.linspace(*config.q, config.n[1]),
+            rtol=config.rtol, atol=config.atol, viewer=config.viewer, tangent=config.tangent,
+            posterior=posterior, attributes=origin,
         )  # fmt: skip
-        out.parent.mkdir(parents=True, exist_ok=True)
         made.save(out)
         if jit.compiled_count():
             output.say(f"compiled {jit.compiled_count()} kernels; the next run finds them in the cache")
         low, high, error = float(made.value.min()), float(made.value.max()), float(made.error.max())
-        output.say(f"wrote {out}: R from {low:.6g} to {high:.6g}, integration error at most {error:.1e} (W m^-2 sr^-1)")
+        kind = "at most" if values.error_is_bound else "an estimated"
+        output.say(f"wrote {out}: R from {low:.6g} to {high:.6g}, integration error {kind} {error:.1e} (W m^-2 sr^-1)")
+        if plot is not None:
+            _plot(made, plot)
+            output.say(f"wrote {plot}")
+            output.result(plot=plot)
         for p, q, weight in made.impulses:
-            output.say(f"impulse at p = {p:.6g}, q = {q:.6g} of weight {weight:.6g}")
+            at = f"p = {round(p, 12) + 0.0:.6g}, q = {round(q, 12) + 0.0:.6g}"
+            output.say(f"impulse at {at} of weight {weight:.6g} (W m^-2 sr^-1 times the area element dp dq)")
         if explain:
-            _explain(output, values.plan)
+            from gonio.cli.explain import explained
+
+            explained(output, made, values, config.rtol)
         output.result(map=out, smallest=low, largest=high, error=error, impulses=made.impulses)
         output.result(plan=[step.describe() for step in values.plan])
         if render is not None:
             _render(output, made, render, step, out, config.rtol)
+
+
+def _make_folder(target: Path) -> None:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as exc:
+        raise DatasetError(f"{target} cannot be written ({exc.strerror or exc}); give another place") from exc
+
+
+def _plot(made: ReflectanceMap, target: Path) -> None:
+    from gonio.files import replace_atomically
+    from gonio.report import map_contours, style
+
+    picture = style.png(map_contours(made))
+    replace_atomically(target, lambda temporary: temporary.write_bytes(picture))
 
 
 def _spacing(text: str | None, render: Path | None) -> tuple[float, ...]:
@@ -86,16 +131,3 @@ def _render(output: Output, made: ReflectanceMap, heights: Path, spacing: tuple[
         f"wrote {target}: {rows} x {columns} pixels, {holes} without a surface, integration error at most {error:.1e}"
     )
     output.result(image=target, pixels_without_surface=holes)
-
-
-def _explain(output: Output, plan: list[Step]) -> None:
-    rows = []
-    for step in plan:
-        d = step.describe()
-        rows.append([
-            f"{d['term']} x {d['source']}", str(d["method"]), str(d["evaluations"]), f"{d['largest_relative_error']:.1e}",
-            f"{1e3 * step.seconds:.1f} ms",
-        ])  # fmt: skip
-    output.table("What was done", ["term x source", "method", "evaluations", "largest rel. error", "time"], rows)
-    for step in plan:
-        output.say(f"  {step.describe()['term']} x {step.describe()['source']}: {step.reason}")

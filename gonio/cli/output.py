@@ -55,6 +55,7 @@ class Output:
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         """A table; the first column left, the others right."""
         from rich.box import SIMPLE_HEAD
+        from rich.console import Console
         from rich.table import Table
         from rich.text import Text
 
@@ -63,7 +64,11 @@ class Output:
             shown.add_column(Text(name), justify="left" if k == 0 else "right", no_wrap=True)
         for row in rows:
             shown.add_row(*(Text(cell) for cell in row))
-        self.console.print(shown)
+        natural = self.console.measure(shown, options=self.console.options.update(max_width=1000)).maximum
+        if natural <= self.console.width:
+            self.console.print(shown)
+        else:  # a narrow terminal breaks the lines, but nothing is cut off
+            Console(highlight=False, quiet=self.as_json, soft_wrap=True, width=natural).print(shown)
 
     @contextlib.contextmanager
     def stage(self, description: str) -> Iterator[Progress]:

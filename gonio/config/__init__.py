@@ -8,18 +8,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from gonio.config.documents import (
-    BRDFConfig,
     FitConfig,
     GridConfig,
     PlanConfig,
-    SceneConfig,
-    SourceConfig,
     load_fit,
     load_plan,
-    load_scene,
     parse_fit,
     parse_plan,
-    parse_scene,
 )
 from gonio.config.reader import read_document
 from gonio.config.rig import (
@@ -33,6 +28,7 @@ from gonio.config.rig import (
     load_rig,
     parse_rig,
 )
+from gonio.config.scene import BRDFConfig, SceneConfig, SourceConfig, load_scene, parse_scene
 
 __all__ = [
     "AxisConfig",

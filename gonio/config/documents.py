@@ -1,7 +1,7 @@
-"""plan.toml, scene.toml and fit.toml: what to measure, what to show, what to fit.
+"""plan.toml and fit.toml: what to measure, what to fit.
 
-It knows the shape of these files. Whether a pose can be reached, a model exists or a source accepts a parameter is
-checked by those who know: `gonio.scan`, `gonio.brdf`, `gonio.source`, `fitting`.
+It knows the shape of these files. Whether a pose can be reached or a model exists is checked by those who know:
+`gonio.scan`, `fitting`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 from gonio.config.reader import Document, Table, read_document
-from gonio.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from gonio.brdf import BRDF
-    from gonio.source import Source
 
 _DIRECTIONS = ("theta_i_deg", "theta_r_deg", "phi_deg")
 _HALF = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
@@ -84,72 +79,6 @@ class PlanConfig:
 
 
 @dataclass(frozen=True)
-class BRDFConfig:
-    """A BRDF: of a run (its table or its fit), or of a model with its parameters."""
-
-    run: str | None
-    use: Literal["table", "fit"]
-    model: str | None
-    parameters: Mapping[str, float]
-
-    def build(self) -> BRDF:
-        """The BRDF of the model.
-
-        A parameter may be written ``albedo`` instead of ``lambertian.albedo`` where no other term has one of that name.
-
-        Raises
-        ------
-        ConfigurationError
-            If it is a run's, or the model or a parameter is unknown, missing or out of range.
-        """
-        from gonio import brdf
-
-        if self.model is None:
-            raise ConfigurationError(f"the BRDF of the run {self.run} is in its files; load them instead of building it")
-        models = brdf.parse(self.model)
-        names = brdf.term_names(models)
-        values: dict[str, dict[str, float]] = {name: {} for name in names}
-        for key, value in self.parameters.items():
-            term, _, parameter = key.rpartition(".")
-            if not term:
-                having = [n for n, m in zip(names, models, strict=True) if key in (p.name for p in m.parameters)]
-                if len(having) != 1:
-                    known = [f"{n}.{p.name}" for n, m in zip(names, models, strict=True) for p in m.parameters]
-                    raise ConfigurationError(f"[brdf] {key} fits {len(having)} terms; write one of: {', '.join(known)}")
-                term, parameter = having[0], key
-            if term not in values:
-                raise ConfigurationError(f"[brdf] {key}: the model has no term {term!r}; it has: {', '.join(names)}")
-            values[term][parameter] = value
-        return brdf.BRDF(brdf.Term(m, m.values(values[name])) for name, m in zip(names, models, strict=True))
-
-
-@dataclass(frozen=True)
-class SourceConfig:
-    """One source: its kind, and its parameters as `gonio.source.make` takes them (angles in radians)."""
-
-    kind: str
-    parameters: Mapping[str, Any]
-
-    def build(self) -> Source:
-        """The source."""
-        from gonio import source
-
-        return source.make(self.kind, **self.parameters)
-
-
-@dataclass(frozen=True)
-class SceneConfig:
-    """A reflectance map to compute: the BRDF, the sources, the ranges of p and q, points on each axis, tolerance."""
-
-    brdf: BRDFConfig
-    sources: tuple[SourceConfig, ...]
-    p: tuple[float, float]
-    q: tuple[float, float]
-    n: int
-    rtol: float
-
-
-@dataclass(frozen=True)
 class FitConfig:
     """A fit: model, parameters freed, fixed and with other priors, seed, largest number of steps."""
 
@@ -164,11 +93,6 @@ class FitConfig:
 def load_plan(path: str | Path) -> PlanConfig:
     """Read a plan file; see `parse_plan`."""
     return parse_plan(read_document(path), str(path))
-
-
-def load_scene(path: str | Path) -> SceneConfig:
-    """Read a scene file; see `parse_scene`."""
-    return parse_scene(read_document(path), str(path))
 
 
 def load_fit(path: str | Path) -> FitConfig:
@@ -214,35 +138,6 @@ def parse_plan(text: str, name: str = "plan.toml") -> PlanConfig:
         document.report("", "grid", "is missing and [poses] too; write at least one [[grid]] or [poses] angles_deg")
     if total > MAX_POSES:
         document.report("", "grid", f"gives {total} poses; gonio plans at most {MAX_POSES}")
-    document.finish()
-    return config
-
-
-def parse_scene(text: str, name: str = "scene.toml") -> SceneConfig:
-    """The scene that a text describes.
-
-    Raises
-    ------
-    ConfigurationError
-        With every problem of the document at once.
-    """
-    document = Document(text, name)
-    root = document.root
-    brdf = _brdf(root.table("brdf"))
-    sources = tuple(_source(table) for table in root.tables("source"))
-    if not sources:
-        document.report("", "source", "is missing; write at least one [[source]]")
-    grid = root.table("grid", required=False)
-    config = SceneConfig(
-        brdf=brdf,
-        sources=sources,
-        p=_range(grid, "p"),
-        q=_range(grid, "q"),
-        n=grid.integer("n", 256, lower=2, upper=20_000, unit="points"),
-        rtol=(root if "rtol" in root else grid).number("rtol", 1e-6, lower=1e-14, upper=0.1),
-    )
-    grid.finish()
-    root.finish()
     document.finish()
     return config
 
@@ -300,46 +195,6 @@ def _poses(table: Table) -> tuple[tuple[float, float, float], ...]:
             continue
         poses.append((math.radians(numbers[0]), math.radians(numbers[1]), math.radians(numbers[2])))
     return tuple(poses)
-
-
-def _brdf(table: Table) -> BRDFConfig:
-    run = table.text("run") if "run" in table else None
-    model = table.text("model") if "model" in table else None
-    use = table.text("use", "fit", choices=("table", "fit"))
-    if model is None:
-        if run is None:
-            table.report("", 'needs run = "..." or model = "..."')
-        table.finish()
-        return BRDFConfig(run, use, None, {})  # type: ignore[arg-type]
-    if run is not None:
-        table.report("model", "does not go with run; write one of them")
-    written = table.table("parameters", required=False).free_numbers()
-    return BRDFConfig(None, use, model, written | table.free_numbers())  # type: ignore[arg-type]
-
-
-def _source(table: Table) -> SourceConfig:
-    kind = table.text("kind")
-    parameters: dict[str, Any] = {}
-    for key in table.names():
-        if key == "kind":
-            continue
-        if key.endswith("_deg"):
-            parameters[key.removesuffix("_deg")] = table.angle(key)
-        elif key == "axis":
-            parameters[key] = table.numbers(key, count=3)
-        elif key in ("theta", "phi", "half_angle"):
-            table.number(key)
-            table.report(key, f"has no unit; write {key}_deg in degrees")
-        else:
-            parameters[key] = table.number(key)
-    return SourceConfig(kind, parameters)
-
-
-def _range(table: Table, key: str) -> tuple[float, float]:
-    low, high = table.numbers(key, (-3.0, 3.0), count=2, lower=-1e8, upper=1e8)
-    if not low < high and key in table:
-        table.report(key, f"= [{low:g}, {high:g}] must ascend")
-    return low, high
 
 
 def _priors(table: Table, prefix: str = "") -> dict[str, tuple[str, float, float]]:

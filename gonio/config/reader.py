@@ -78,6 +78,8 @@ class Document:
             raise ConfigurationError(f"{name} is nested too deeply; gonio's files have at most three levels") from None
         except ValueError as error:  # an integer of thousands of digits
             raise ConfigurationError(f"{name} has a value that cannot be read: {error}; correct it") from error
+        if _too_deep(values):
+            raise ConfigurationError(f"{name} is nested too deeply; gonio's files have at most three levels")
         self._lines = _line_numbers(text)
         self.root = Table(self, values, "")
 
@@ -232,6 +234,23 @@ class Table:
             return []
         return [self._child(v, self._inner(f"{key}.{number}")) for number, v in enumerate(value, 1)]
 
+    def get(self, key: str) -> Any:
+        """The value of `key` as it is, None if it is not there."""
+        return self._values.get(key)
+
+    def forget(self, key: str) -> None:
+        """What is wrong with `key` has been said."""
+        self._asked.append(key)
+
+    def items(self, key: str) -> list[Table]:
+        """For each number of the list at `key` a table that has it at `key`: what reads one number reads them all."""
+        listed = [v for v in self._values[key] if _number(v) is not None]
+        return [Table(self.document, {key: v}, self.place) for v in listed]
+
+    def holds_list(self, key: str) -> bool:
+        """Whether the value of `key` is a list."""
+        return isinstance(self._values.get(key), list)
+
     def holds_text(self, key: str) -> bool:
         """Whether the value of `key` is a text."""
         return isinstance(self._values.get(key), str)
@@ -248,14 +267,24 @@ class Table:
                 self.report(key, f"is {_show(value)}; every number in it must be finite")
         return dict(self._values)
 
-    def free_numbers(self, prefix: str = "") -> dict[str, float]:
+    def free_numbers(self) -> dict[str, float]:
         """Keys not asked for so far as numbers, those of sub-tables joined by a dot: ``{"ggx.alpha": 0.2}``."""
-        found: dict[str, float] = {}
+        return {key: value if isinstance(value, float) else math.nan for key, value in self._free("", False).items()}
+
+    def free_values(self) -> dict[str, float | str | bool]:
+        """As `free_numbers`, with texts and flags as they are."""
+        return self._free("", True)
+
+    def _free(self, prefix: str, choices: bool) -> dict[str, float | str | bool]:
+        found: dict[str, float | str | bool] = {}
         for key, value in self._values.items():
             if key in self._asked:
                 continue
             if isinstance(value, dict):
-                found.update(self.table(key).free_numbers(f"{prefix}{key}."))
+                found.update(self.table(key)._free(f"{prefix}{key}.", choices))
+            elif choices and isinstance(value, str | bool):
+                self._asked.append(key)
+                found[prefix + key] = value
             else:
                 found[prefix + key] = self.number(key)
         return found
@@ -320,6 +349,17 @@ def _finite(value: Any) -> bool:
     if isinstance(value, list):
         return all(_finite(v) for v in value)
     return isinstance(value, str | bool) or _number(value) is not None
+
+
+def _too_deep(values: Mapping[str, Any], most: int = 16) -> bool:
+    """Whether tables and lists are nested more than `most` levels deep: a dotted key may be thousands."""
+    level: list[Any] = [values]
+    for _ in range(most):
+        level = [
+            inner for one in level for inner in (one.values() if isinstance(one, dict) else one)
+            if isinstance(inner, dict | list)
+        ]  # fmt: skip
+    return bool(level)
 
 
 def _show(value: Any) -> str:

@@ -35,7 +35,8 @@ class Step:
     reason : str
         Why this method; what was skipped.
     seconds, error : float
-        Filled by the run: wall time [s] and the largest relative error.
+        Filled by the run: wall time [s], without that of loading and compiling kernels, and the largest error relative to
+        what the step itself adds, or to the sum of the steps so far where the method shares the tolerance with them (rings).
     """
 
     term: Term

@@ -8,11 +8,13 @@ way it runs.
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gonio import jit
 from gonio.brdf.base import BRDF
 from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.fields import Field, FunctionField, Lobes
@@ -101,6 +103,7 @@ def seen_from(
         placed = replace(turned, view=rotation)
         for step in plan(brdf, Source(slow)):
             assert isinstance(step.part, Field)
+            start = time.perf_counter() - jit.getting_ready_s()
             if step.method is Method.ZERO:
                 v, e = np.zeros(len(seen)), np.zeros(len(seen))
             elif step.method is Method.MIRROR:
@@ -111,6 +114,8 @@ def seen_from(
                 v, e = over_field(step.term, step.part, elements, rtol=rtol, atol=atol / len(slow), effort=step.effort)
             value[seen] += v
             error[seen] += e
+            step.error = float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
+            step.seconds = max(0.0, time.perf_counter() - jit.getting_ready_s() - start)
             steps.append(step)
     bound = not depends_on_user(brdf, Source.of(source))
     result = MapValues(value.reshape(p.shape), error.reshape(p.shape), impulses, steps, error_is_bound=bound)

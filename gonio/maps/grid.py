@@ -26,12 +26,13 @@ from gonio.files import replace_atomically
 from gonio.integrate import Estimate, MapValues, reflectance_map
 from gonio.maps import surface
 from gonio.maps.interpolation import Interpolant
-from gonio.source import Source
+from gonio.source import Cap, Collimated, Source
 
 Array = NDArray[np.float64]
 Method = Literal["auto", "integrate", "interpolate"]
 CONFIDENCE = 0.68
 _QUANTILES = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+_SMALL = 0.1  # half angle of a disk [rad] below which it is a small source
 _BAND_RTOL = 1e-4  # far below the width of any measured band
 
 
@@ -50,11 +51,15 @@ class ReflectanceMap:
     impulses : tuple of (p, q, weight)
         Delta functions, memo 15a.
     sources : tuple of (p, q)
-        Gradients that face the beams of the source, for plots.
+        Gradients that face beams and small disks of the source, for plots.
     attributes : mapping
     brdf, source : BRDF and Source, optional
         The scene, where it is known: `compute` fills them in, a file does not keep them. With them the map is exact
         anywhere; ``dataclasses.replace(map, brdf=..., source=...)`` gives them to a loaded map.
+    viewer : (theta, phi), optional
+        Direction of a viewer off the z axis [rad].
+    tangent : float, optional
+        Rotation of a grained surface's x axis about its normal [rad], the same for all gradients.
     """
 
     p: Array
@@ -67,6 +72,8 @@ class ReflectanceMap:
     attributes: Mapping[str, str] = field(default_factory=dict)
     brdf: BRDF | None = field(default=None, repr=False, compare=False)
     source: Source | None = field(default=None, repr=False, compare=False)
+    viewer: tuple[float, float] | None = None
+    tangent: float | None = None
 
     @property
     def has_scene(self) -> bool:
@@ -108,7 +115,7 @@ class ReflectanceMap:
         p, q = np.broadcast_arrays(np.asarray(p, dtype=float), np.asarray(q, dtype=float))
         if self._integrates(method):
             assert self.brdf is not None and self.source is not None
-            exact = reflectance_map(self.brdf, self.source, p, q, rtol=rtol)
+            exact = reflectance_map(self.brdf, self.source, p, q, rtol=rtol, viewer=self.viewer, tangent=self.tangent)
             return Estimate(exact.value, exact.error, error_is_bound=exact.error_is_bound)
         if np.any(np.isnan(p)) or np.any(np.isnan(q)):
             raise GeometryError("a gradient is NaN: give finite p and q")
@@ -193,7 +200,7 @@ class ReflectanceMap:
         """Value and honest error, whether or not the tolerance is met; NaN outside a map without a scene."""
         if self._integrates(method):
             assert self.brdf is not None and self.source is not None
-            best = _evaluate(self.brdf, self.source, p, q, rtol, True)
+            best = _evaluate(self.brdf, self.source, p, q, True, rtol=rtol, viewer=self.viewer, tangent=self.tangent)
             return Estimate(best.value, best.error, error_is_bound=best.error_is_bound)
         value, _, error = self.interpolant(p.ravel(), q.ravel())
         return Estimate(value[:, 0].reshape(p.shape), error[:, 0].reshape(p.shape), error_is_bound=False)
@@ -222,6 +229,7 @@ class ReflectanceMap:
             "impulses": json.dumps(self.impulses),
             "sources": json.dumps(self.sources),
             "attributes": json.dumps(dict(self.attributes)),
+            "view": json.dumps({"viewer": self.viewer, "tangent": self.tangent}),
         }
         target = Path(path)
         data_set = xr.Dataset(data, coordinates, attributes)
@@ -242,6 +250,8 @@ class ReflectanceMap:
         try:
             with xr.open_dataset(path, engine="h5netcdf") as data:
                 band = data["R_band"].to_numpy() if "R_band" in data else None
+                view = json.loads(data.attrs.get("view", "{}"))
+                viewer, tangent = view.get("viewer"), view.get("tangent")
                 return cls(
                     data["p"].to_numpy(),
                     data["q"].to_numpy(),
@@ -251,6 +261,8 @@ class ReflectanceMap:
                     tuple((float(a), float(b), float(c)) for a, b, c in json.loads(data.attrs["impulses"])),
                     tuple((float(a), float(b)) for a, b in json.loads(data.attrs["sources"])),
                     {str(k): str(v) for k, v in json.loads(data.attrs["attributes"]).items()},
+                    viewer=None if viewer is None else (float(viewer[0]), float(viewer[1])),
+                    tangent=None if tangent is None else float(tangent),
                 )
         except FileNotFoundError:
             raise DatasetError(f"{path}: there is no such file; make it with: gonio map SCENE.toml --out {path}") from None
@@ -265,6 +277,9 @@ def compute(
     q: Array,
     *,
     rtol: float = 1e-6,
+    atol: float = 0.0,
+    viewer: tuple[float, float] | None = None,
+    tangent: float | None = None,
     draws: Iterable[BRDF] = (),
     attributes: Mapping[str, str] | None = None,
     progress: Callable[[int], None] | None = None,
@@ -278,8 +293,10 @@ def compute(
     source : Source or callable
     p, q : ndarray, shapes (n,) and (m,)
         Axes of the grid.
-    rtol : float, optional
-        Relative error requested of the integrator.
+    rtol, atol : float, optional
+        Relative and absolute [W m^-2 sr^-1] error requested of the integrator.
+    viewer, tangent : optional
+        As for `gonio.reflectance_map`; the grain is rotated by the same angle [rad] at all gradients.
     draws : iterable of BRDF, optional
         Posterior draws; the band is their pointwise 16 and 84 % quantile.
     attributes : mapping, optional
@@ -301,27 +318,32 @@ def compute(
     if p.ndim != 1 or q.ndim != 1 or p.size < 2 or q.size < 2:
         raise ParameterError("a map needs two axes of at least two gradients each")
     source, p_all, q_all = Source.of(source), p[None, :], q[:, None]
-    values = _evaluate(brdf, source, p_all, q_all, rtol, tolerant)
+    scene: dict[str, Any] = {"atol": atol, "viewer": viewer, "tangent": tangent}
+    values = _evaluate(brdf, source, p_all, q_all, tolerant, rtol=rtol, **scene)
     stack = []
     for count, draw in enumerate(draws, 1):
-        stack.append(_evaluate(draw, source, p_all, q_all, max(rtol, _BAND_RTOL), True).value)
+        stack.append(_evaluate(draw, source, p_all, q_all, True, rtol=max(rtol, _BAND_RTOL), **scene).value)
         if progress is not None:
             progress(count)
     band = np.quantile(np.array(stack), _QUANTILES, axis=0) if stack else None
-    facing = tuple(
-        (-part.direction[0] / part.direction[2], -part.direction[1] / part.direction[2])
-        for part in source.parts
-        if hasattr(part, "direction") and part.direction[2] > 0
-    )
+    facing = tuple((-axis[0] / axis[2], -axis[1] / axis[2]) for axis in _small_sources(source) if axis[2] > 0)
     made = ReflectanceMap(
-        p, q, values.value, values.error, band, tuple(values.impulses), facing, dict(attributes or {}), brdf, source
-    )
+        p, q, values.value, values.error, band, tuple(values.impulses), facing, dict(attributes or {}), brdf, source,
+        viewer, tangent,
+    )  # fmt: skip
     return made, values
 
 
-def _evaluate(brdf: BRDF, source: Source, p: Array, q: Array, rtol: float, tolerant: bool) -> MapValues:
+def _small_sources(source: Source) -> list[tuple[float, float, float]]:
+    """Directions of what shines from about one direction."""
+    beams = [part.direction for part in source.parts if isinstance(part, Collimated) and part.irradiance > 0]
+    disks = [part.axis for part in source.parts if isinstance(part, Cap) and part.half_angle < _SMALL and part.radiance > 0]
+    return beams + disks
+
+
+def _evaluate(brdf: BRDF, source: Source, p: Array, q: Array, tolerant: bool, **scene: Any) -> MapValues:
     try:
-        return reflectance_map(brdf, source, p, q, rtol=rtol)
+        return reflectance_map(brdf, source, p, q, **scene)
     except IntegrationError as exc:
         if not tolerant or not isinstance(exc.best, MapValues):
             raise

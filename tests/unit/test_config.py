@@ -172,7 +172,7 @@ def test_scene_parameters_and_sources() -> None:
     assert scene.brdf.build().parameters() == {"lambertian.albedo": 0.8}
     assert scene.sources[0].parameters == {"theta": math.pi / 3, "phi": math.pi / 2}
     assert scene.sources[1].parameters == {"radiance": 2.0}
-    assert (scene.p, scene.q, scene.n) == ((-1.0, 2.0), (-3.0, 3.0), 11)
+    assert (scene.p, scene.q, scene.n) == ((-1.0, 2.0), (-3.0, 3.0), (11, 11))
     with pytest.raises(ConfigurationError, match="write theta_deg in degrees"):
         config.parse_scene('[brdf]\nrun = "r"\n[[source]]\nkind = "collimated"\ntheta = 1.0\n')
     with pytest.raises(ConfigurationError, match="did you mean 'run'"):
