@@ -46,7 +46,7 @@ def gauss_table() -> tuple[Array, Array]:
     return np.concatenate([(x + 1.0) / 2.0 for x, _ in rules]), np.concatenate([w / 2.0 for _, w in rules])
 
 
-@jit.model
+@jit.part
 def _insert(points, count, value, lower, upper):  # type: ignore[no-untyped-def]
     """Insert a breakpoint into the sorted list if it is inside and new; returns the new count."""
     slack = 1e-13 * (upper - lower)
@@ -63,7 +63,7 @@ def _insert(points, count, value, lower, upper):  # type: ignore[no-untyped-def]
     return count + 1
 
 
-@jit.model
+@jit.part
 def _grow(points, count, centre, scale, lower, upper):  # type: ignore[no-untyped-def]
     """Insert the centre and panels that grow from it in both directions."""
     count = _insert(points, count, centre, lower, upper)
@@ -75,7 +75,7 @@ def _grow(points, count, centre, scale, lower, upper):  # type: ignore[no-untype
     return count
 
 
-@jit.model
+@jit.part
 def _order(a, b, centre, scale, digits):  # type: ignore[no-untyped-def]
     """Order q with rho^(-2 q) = exp(-digits) for a panel [a, b] and poles at centre +- i scale."""
     half = 0.5 * (b - a)
@@ -85,7 +85,7 @@ def _order(a, b, centre, scale, digits):  # type: ignore[no-untyped-def]
     return digits / (2.0 * math.log(rho))
 
 
-@jit.model
+@jit.part
 def _theta_panels(points, sn, cn, theta_n, width, layer, planes, breaks, rows):  # type: ignore[no-untyped-def]
     """Edges of the panels in theta; returns how many."""
     upper = min(math.pi, 0.5 * math.pi + theta_n)
@@ -133,7 +133,7 @@ def _theta_panels(points, sn, cn, theta_n, width, layer, planes, breaks, rows): 
     return count + 1
 
 
-@jit.model
+@jit.part
 def _touches(planes, a, b, sn, cn):  # type: ignore[no-untyped-def]
     """Whether a plane of kinks touches one of the two rings."""
     for k in range(planes.shape[0]):
@@ -145,14 +145,14 @@ def _touches(planes, a, b, sn, cn):  # type: ignore[no-untyped-def]
     return False
 
 
-@jit.model
+@jit.part
 def _field_panels(breaks, t):  # type: ignore[no-untyped-def]
     """How many panels of the field there are up to t, a real number."""
     k = min(max(np.searchsorted(breaks, t, side="right") - 1, 0), breaks.size - 2)
     return k + (t - breaks[k]) / (breaks[k + 1] - breaks[k])
 
 
-@jit.model
+@jit.part
 def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: ignore[no-untyped-def]
     """Append the nodes of an arc [a, b], in as many pieces as the largest order asks for; returns how many nodes."""
     pieces = max(1, math.ceil(order / LARGEST_ORDER))
@@ -169,7 +169,7 @@ def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: igno
     return n
 
 
-@jit.model
+@jit.part
 def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, per_radian, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
     """Nodes in D on the half ring from 0 to the horizon, weights times `scale`; returns how many."""
     reach, clipped = math.pi, False
