@@ -11,10 +11,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gonio.brdf.base import Model, _suggest
+from gonio.brdf.eon import EON
+from gonio.brdf.hapke import hapke
+from gonio.brdf.kubelka_munk import KUBELKA_MUNK
 from gonio.brdf.lambertian import LAMBERTIAN
+from gonio.brdf.lommel_seeliger import LOMMEL_SEELIGER
 from gonio.brdf.microfacet import GGX
-from gonio.brdf.oren_nayar import OREN_NAYAR
+from gonio.brdf.minnaert import MINNAERT
+from gonio.brdf.oren_nayar import OREN_NAYAR, OREN_NAYAR_FULL
 from gonio.brdf.phong import PHONG
+from gonio.brdf.plastic import PLASTIC
 from gonio.brdf.specular import SPECULAR
 from gonio.errors import ParameterError
 
@@ -66,14 +72,20 @@ def single(model: Model) -> Family:
 
 
 def _oren_nayar(variant: str) -> Model:
-    return {"qualitative": OREN_NAYAR}[variant]
+    return {"qualitative": OREN_NAYAR, "full": OREN_NAYAR_FULL}[variant]
 
 
 FAMILIES: dict[str, Family] = {
     family.name: family
     for family in (
         single(LAMBERTIAN),
-        Family("oren_nayar", _oren_nayar, {"variant": ("qualitative",)}),
+        Family("oren_nayar", _oren_nayar, {"variant": ("qualitative", "full")}),
+        single(EON),
+        single(MINNAERT),
+        single(LOMMEL_SEELIGER),
+        Family("hapke", hapke, {"H": ("1981", "2002")}),
+        single(KUBELKA_MUNK),
+        single(PLASTIC),
         single(PHONG),
         single(GGX),
         single(SPECULAR),

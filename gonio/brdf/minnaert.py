@@ -1,0 +1,56 @@
+r"""Minnaert's law of the lunar surface: Lambert's with one exponent for limb darkening.
+
+.. math:: f_r = \frac{\rho}{\pi}\,(\mu_i\,\mu_r)^{k-1}
+
+k = 1 is Lambert's surface; dark soils near opposition show k of 0.5 to 0.7. The albedo is a coefficient: the
+directional albedo, :math:`2\rho\,\mu_r^{k-1}/(k+1)`, has no bound for k < 1, where f_r itself is infinite at the horizon.
+
+References
+----------
+.. [1] M. Minnaert, "The Reciprocity Principle in Lunar Photometry", Astrophysical Journal 93, 1941. doi:10.1086/144279
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio import jit
+from gonio.brdf.base import Model, Parameter
+from gonio.brdf.elementary import power
+
+Array = NDArray[np.float64]
+INV_PI = 1.0 / math.pi
+_LEAST = 1e-300  # of the product of the cosines: f_r stays finite
+
+
+@jit.model
+def minnaert_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
+    albedo, k = p[0], p[1]
+    lit = (zi > 0.0) & (zr > 0.0)
+    product = zi * zr if lit else 1.0
+    product = product if product > _LEAST else _LEAST
+    return albedo * INV_PI * power(product, k - 1.0) if lit else 0.0
+
+
+def _kinks(p: Array, omega_r: Array) -> Array:
+    """The horizon, where mu_i^(k - 1) has no derivatives, unless k - 1 is 0 or 1."""
+    if p[1] in (1.0, 2.0):
+        return np.empty((*omega_r.shape[:-1], 0, 4))
+    return np.broadcast_to(np.array([[0.0, 0.0, 1.0, 0.0]]), (*omega_r.shape[:-1], 1, 4))
+
+
+MINNAERT = Model(
+    name="minnaert",
+    parameters=(
+        Parameter("albedo", 0.0, 1.0, "pi f_r at normal incidence, seen from the normal", ("uniform", 0.0, 1.0)),
+        Parameter("k", 0.0, 2.0, "limb darkening; 1 is Lambert's surface", ("uniform", 0.0, 2.0)),
+    ),
+    function=minnaert_f_r,
+    doc="albedo / pi (cos theta_i cos theta_r)^(k - 1); infinite at the horizon for k < 1.",
+    reference="Minnaert, Astrophysical Journal 93, 1941",
+    kinks=_kinks,
+    energy_bounded=False,
+)
