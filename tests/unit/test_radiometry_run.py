@@ -47,6 +47,18 @@ def run(tmp_path):
         yield run
 
 
+def scale_by_hand(rig, repeats):
+    """Certificate, photon and read noise of a white block (EMVA 1288: variance K S + K^2 sigma_d^2 + 1/12 per pixel; the
+    exposures weighted by their precision), and encoders that round, at the white's angles: d ln cos(arm - pan) = tan 15 deg.
+    """
+    camera, (_, _, width, height) = rig.camera, rig.camera.roi
+    gain, t = camera.gain_dn_per_e, np.array(EXPOSURES)
+    per_pixel = gain * WHITE_RATE * t + (gain * camera.read_noise_e) ** 2 + 1 / 12
+    photons = 1 / np.sqrt(repeats * width * height * np.sum(t**2 / per_pixel)) / WHITE_RATE
+    encoders = np.sqrt(2) * np.tan(np.radians(15)) * (2 * np.pi / 4096) / np.sqrt(12)
+    return np.sqrt(rig.white.u_beta**2 + photons**2 + encoders**2)
+
+
 def test_samples_come_from_measured_angles_and_the_drifting_white(run):
     """A sample that reads half the white's rate, at the white's angles and at others."""
     rig = config.parse_rig(run.document("rig.toml"))
@@ -60,7 +72,7 @@ def test_samples_come_from_measured_angles_and_the_drifting_white(run):
     assert samples.theta_r[:2] == pytest.approx(np.radians([15, 0]), abs=1e-12)
     assert calls[-1] == ("reduce", 3, 3)
     assert [s.name for s in samples.shared] == ["scale", "arm", "pan", "tilt", "drift"]
-    assert samples.shared[0].u == pytest.approx(rig.white.u_beta, rel=0.03)  # and the noise of the white
+    assert samples.shared[0].u == pytest.approx(scale_by_hand(rig, repeats=2), rel=2e-3)
     assert samples.shared[1].u == pytest.approx(np.radians(0.1))
     assert samples.attributes["rig"] == rig.name and samples.attributes["white_not_bracketed"] == "0"
 
