@@ -285,6 +285,41 @@ class BRDF:
             accumulate(term.model)(flat_i, flat_r, term.values, term.weight, out)
         return out.reshape(wi.shape[:-1])
 
+    def jacobian(self, omega_i: ArrayLike, omega_r: ArrayLike) -> Array:
+        """Derivatives of the BRDF value with respect to the parameters.
+
+        Parameters
+        ----------
+        omega_i, omega_r : array_like, shapes broadcast to (..., 3)
+            Unit vectors in the local frame.
+
+        Returns
+        -------
+        ndarray, shape (..., k)
+            [1/sr per unit of the parameter], in the order of `parameters`; weights of terms are counted in. One-sided at
+            the end of a parameter's range, infinite where the derivative is; see `gonio.brdf.derivatives`.
+
+        Raises
+        ------
+        ParameterError
+            If a term is a delta function.
+
+        Examples
+        --------
+        >>> import gonio
+        >>> up = np.array([0.0, 0.0, 1.0])
+        >>> float(gonio.brdf.make("lambertian", albedo=0.5).jacobian(up, up)[0]) * math.pi
+        1.0
+        """
+        from gonio.brdf.derivatives import jacobian
+
+        for term in self.terms:
+            accumulate(term.model)  # a delta function has none
+        wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
+        flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
+        rows = jacobian(self.terms, flat_i, flat_r)
+        return np.moveaxis(rows.reshape(len(rows), *wi.shape[:-1]), 0, -1)
+
 
 def accumulate(model: Model) -> Any:
     """``kernel(omega_i (n, 3), omega_r (n, 3), p, weight, out (n,))`` that adds weight * f_r; compiled if it can be."""

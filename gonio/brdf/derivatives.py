@@ -1,0 +1,168 @@
+r"""Derivatives of a BRDF with respect to its parameters.
+
+Compiled models are differentiated automatically (`gonio.brdf.tangent`): the derivative is that of the formula as it is
+computed, to the last digits, at the ends of the parameters' ranges too. Numbers that a model derives from its parameters
+enter by the chain rule. What cannot be rewritten, and the derived numbers themselves, are differentiated by interpolation
+between values inside the parameter's range.
+
+At an end of a range the derivative is one-sided; where it is infinite, so is the number given. It is never NaN.
+
+References
+----------
+.. [1] J.-P. Berrut, L. N. Trefethen, "Barycentric Lagrange Interpolation", SIAM Review 46(3), 2004, section 9.3
+   (differentiation matrices).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio import jit
+from gonio.brdf.tangent import tangent
+from gonio.errors import ParameterError
+
+if TYPE_CHECKING:
+    from gonio.brdf.base import Model, Parameter, Term
+
+Array = NDArray[np.float64]
+NODES, LEVELS = 13, 10  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
+_STEEPER = 1.3  # growth from one length to the next, again and again, of a derivative that is infinite at the range's end
+_ENOUGH = 1e-13  # relative change from one length to the next at which no shorter one is tried
+
+
+def jacobian(terms: tuple[Term, ...], omega_i: Array, omega_r: Array) -> Array:
+    """Derivatives of the sum of terms [1/sr per unit of the parameter], shape (k, n), for unit vectors (n, 3)."""
+    rows = [_of_term(term, omega_i, omega_r) for term in terms]
+    return np.concatenate(rows) if rows else np.zeros((0, len(omega_i)))
+
+
+def how(model: Model) -> str:
+    """How a model is differentiated: ``"automatic"``, or ``"differences: "`` and why."""
+    if model.function is None:
+        return "differences: it is not compiled" if model.array_function is not None else "none: a delta function"
+    try:
+        tangent(model.function)
+    except ParameterError as exc:
+        return f"differences: {exc}"
+    return "automatic"
+
+
+def _of_term(term: Term, omega_i: Array, omega_r: Array) -> Array:
+    model, p = term.model, term.values
+    k = len(model.parameters)
+    if k == 0:
+        return np.zeros((0, len(omega_i)))
+    out = np.zeros((k, len(omega_i)))
+    if how(model) == "automatic":
+        _filling(model.function)(omega_i, omega_r, p, seeds(model, p), term.weight, out)
+        lost = np.flatnonzero(np.isnan(out).any(axis=0))  # an infinity met a zero on the way
+        if lost.size:
+            again = _differences(term, omega_i[lost], omega_r[lost])
+            out[:, lost] = np.where(np.isnan(out[:, lost]), again, out[:, lost])
+        return out
+    return _differences(term, omega_i, omega_r)
+
+
+@functools.cache
+def _filling(function: Callable[..., float]) -> Any:
+    """``kernel(omega_i (n, 3), omega_r (n, 3), p, seeds (k, p.size), weight, out (k, n))``."""
+    slope = tangent(function).function
+
+    def fill_slopes(omega_i, omega_r, p, seeds, weight, out):  # type: ignore[no-untyped-def]
+        i, r = omega_i.ravel(), omega_r.ravel()
+        for j in range(seeds.shape[0]):
+            to, d = out[j], seeds[j]
+            for k in range(to.size):
+                a, b = 3 * k, 3 * k + 1
+                to[k] = weight * slope(i[a], i[b], i[a + 2], r[a], r[b], r[a + 2], p, d)[1]
+
+    return jit.kernel(fill_slopes)
+
+
+def seeds(model: Model, p: Array) -> Array:
+    """Derivatives of the parameter array, derived numbers included, with respect to the k parameters: (k, p.size)."""
+    k = len(model.parameters)
+    out = np.zeros((k, len(p)))
+    out[:, :k] = np.eye(k)
+    if model.derived is not None:
+        for j, parameter in enumerate(model.parameters):
+            out[j, k:] = differentiate(_along(model.derived, p[:k], j), float(p[j]), parameter)
+    return out
+
+
+def _along(function: Callable[[Array], Array], p: Array, j: int) -> Callable[[float], Array]:
+    def moved(value: float) -> Array:
+        q = p.copy()
+        q[j] = value
+        return np.asarray(function(q), dtype=float)
+
+    return moved
+
+
+def _differences(term: Term, omega_i: Array, omega_r: Array) -> Array:
+    from gonio.brdf.base import accumulate
+
+    model, kernel = term.model, accumulate(term.model)
+    k = len(model.parameters)
+
+    def f_r(q: Array) -> Array:
+        out = np.zeros(len(omega_i))
+        kernel(omega_i, omega_r, model.complete(q), term.weight, out)
+        return out
+
+    columns = [
+        differentiate(_along(f_r, term.values[:k], j), float(term.values[j]), parameter)
+        for j, parameter in enumerate(model.parameters)
+    ]
+    return np.array(columns)
+
+
+def differentiate(function: Callable[[float], Array], x: float, parameter: Parameter) -> Array:
+    """Derivative (m,) of a function of one parameter at x, from values inside the parameter's range only.
+
+    Polynomials through Chebyshev nodes on shorter and shorter intervals around x, one-sided where the range ends; of
+    each number the derivative counts that changed least from one interval to the next.
+    """
+    span, (kind, a, b) = parameter.upper - parameter.lower, parameter.prior
+    scale = b - a if kind == "uniform" else max(abs(x), float(np.exp(a - 3.0 * b)))
+    half = 0.25 * min(scale, span)
+    best = last = error = grown = np.zeros(0)
+    for level in range(LEVELS):
+        nodes, weights = _rule(x, max(parameter.lower, x - half), min(parameter.upper, x + half))
+        values = np.array([function(float(t)) for t in nodes])
+        if level == 0 and np.all(values == values[0]):
+            return np.zeros(values.shape[1])
+        now = weights @ (values - values[nodes == x])
+        if level == 0:
+            best, error, grown = now, np.full(len(now), np.inf), np.zeros(len(now))
+        else:
+            change = np.abs(now - last)
+            best = np.where(change < error, now, best)
+            error = np.minimum(error, change)
+            grown = np.where(np.abs(now) > _STEEPER * np.abs(last), grown + 1, 0)
+            if np.all(error <= _ENOUGH * np.max(np.abs(best), initial=0.0)):
+                break
+        last, half = now, 0.25 * half
+    infinite = (grown >= LEVELS // 2) & (x in (parameter.lower, parameter.upper))  # a root's slope doubles with each length
+    return np.where(infinite, np.copysign(np.inf, last), best)
+
+
+def _rule(x: float, lower: float, upper: float) -> tuple[Array, Array]:
+    """Nodes with x among them, and the weights of their values in the polynomial's derivative at x."""
+    nodes = 0.5 * (lower + upper) - 0.5 * (upper - lower) * np.cos(np.pi * np.arange(NODES) / (NODES - 1))
+    nodes = np.clip(nodes, lower, upper)
+    at = int(np.argmin(np.abs(nodes - x)))
+    nodes[at] = x
+    apart = (nodes[:, None] - nodes[None, :]) / (upper - lower) * 4.0
+    np.fill_diagonal(apart, 1.0)
+    w = 1.0 / np.prod(apart, axis=1)  # barycentric weights
+    to = x - nodes
+    to[at] = 1.0
+    weights = w / w[at] / to
+    weights[at] = 0.0  # values are taken relative to the one at x
+    return nodes, weights
