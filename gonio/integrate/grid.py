@@ -56,6 +56,11 @@ class Gradients:
         """Ranges of the list; they depend on its size only."""
         return [(a, min(a + TILE, self.size)) for a in range(0, self.size, TILE)]
 
+    def select(self, index: NDArray[np.intp]) -> Gradients:
+        """Some of them, as a list."""
+        row, column = np.divmod(index, self.p.shape[1])
+        return Gradients(self.p[row, column], self.q[row, column])
+
     def elements(self, start: int = 0, stop: int | None = None) -> Elements:
         """Surface elements of a range."""
         count = (self.size if stop is None else stop) - start

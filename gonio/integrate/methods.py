@@ -18,7 +18,10 @@ from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients, add_beam, add_diffuse
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
-from gonio.integrate.rings import integrate_rings
+from gonio.integrate.results import ROUNDING
+from gonio.integrate.ring_patches import Room
+from gonio.integrate.ring_table import tabulate
+from gonio.integrate.rings import integrate_rings, scene_of, slopes_are_few
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
@@ -57,14 +60,9 @@ class Run:
             return max(tiling.run(lambda tile: by_tile(tile, value, error), self.gradients.tiles(), count), default=0.0)
         if isinstance(step.part, Cap) and step.method is Method.GENERAL and disk.suits(step.term, step.part):
             return self._disk(step, step.part, count, value, error)
-        elements = self.gradients.elements()
         if step.method is Method.RINGS and isinstance(step.part, Field):
-            # what the steps before leave of the tolerance, which is relative to their sum
-            spare = np.maximum(self.atol, 0.5 * (self.rtol * np.abs(value) - error))
-            v, e = self._rings(step, step.part, elements, spare, count)
-            value += v
-            error += e
-            return float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0), initial=0.0))
+            return self._rings(step, step.part, count, value, error)
+        elements = self.gradients.elements()
         if not step.term.model.isotropic and self.tangent is not None:
             elements = elements.turned(self.tangent)
         v, e = self._by_element(step, elements, count)
@@ -103,22 +101,54 @@ class Run:
             worst = max(worst, float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0))))
         return worst
 
-    def _rings(self, step: Step, field: Field, elements: Elements, spare: Array, threads: int) -> tuple[Array, Array]:
-        """By rings; few elements, and those that rings leave above their tolerance, by adaptive cells."""
+    def _rings(self, step: Step, field: Field, threads: int, value: Array, error: Array) -> float:
+        """By rings; few gradients, and those that rings leave above their tolerance, by adaptive cells."""
+        grid, rtol = self.gradients, self.rtol
         coarse = not isinstance(field, EnvironmentMap) or field.samples.size <= _TEXELS
-        if coarse and len(elements) <= _HANDFUL:
-            atol = float(np.min(spare, initial=np.inf))
-            return over_field(step.term, field, elements, rtol=self.rtol, atol=atol, effort=step.effort)
-        v, e = integrate_rings(step.term, field, elements, rtol=self.rtol, atol=spare, effort=step.effort, cores=threads)
-        missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
-        if 0 < missed.size <= (4 * _FEW if coarse else _FEW):
-            atol = float(spare[missed].min())
-            again, left = over_field(
-                step.term, field, elements.select(missed), rtol=self.rtol, atol=atol, effort=step.effort
-            )
-            better = left < e[missed]
-            v[missed[better]], e[missed[better]] = again[better], left[better]
-        return v, e
+        most = 4 * _FEW if coarse else _FEW  # for cells
+        scene = scene_of(step.term, field, rtol, step.effort, threads)
+        if slopes_are_few(grid):
+            elements, spare = grid.elements(), self._spare(value, error)
+            if coarse and grid.size <= _HANDFUL:
+                v, e = self._cells(step, field, elements, spare)
+            else:
+                v, e = integrate_rings(scene, elements, rtol=rtol, atol=spare)
+                missed = np.flatnonzero(e > np.maximum(rtol * np.abs(v), spare))
+                if 0 < missed.size <= most:
+                    again, left = self._cells(step, field, elements.select(missed), spare[missed])
+                    better = left < e[missed]
+                    v[missed[better]], e[missed[better]] = again[better], left[better]
+            value += v
+            error += e
+            return _largest(e, value, ROUNDING * np.max(np.abs(value), initial=0.0))
+        room = Room(grid, rtol, self.atol, value, error, threads)
+        table = tabulate(scene, rtol, room)
+        negligible = ROUNDING * max(room.largest, table.largest)
+
+        def add(tile: tuple[int, int]) -> tuple[float, NDArray[np.intp]]:
+            return table.add(grid, tile, rtol, self.atol, value, error, negligible)
+
+        done = tiling.run(add, grid.tiles(), threads)
+        missed = np.concatenate([index for _, index in done])
+        worst = max(relative for relative, _ in done)
+        if 0 < missed.size <= most:
+            some = grid.select(missed)
+            v, e = np.zeros(missed.size), np.zeros(missed.size)
+            table.add(some, (0, missed.size), rtol, self.atol, v, e)
+            spare = self._spare(value[missed] - v, error[missed] - e)
+            again, left = self._cells(step, field, some.elements(), spare)
+            better = left < e
+            value[missed[better]] += (again - v)[better]
+            error[missed[better]] += (left - e)[better]
+        return max(worst, _largest(error[missed], value[missed], negligible))
+
+    def _spare(self, value: Array, error: Array) -> Array:
+        """What steps before leave of the tolerance, which is relative to the sum."""
+        return np.maximum(self.atol, 0.5 * (self.rtol * np.abs(value) - error))
+
+    def _cells(self, step: Step, field: Field, elements: Elements, spare: Array) -> tuple[Array, Array]:
+        atol = float(np.min(spare, initial=np.inf))
+        return over_field(step.term, field, elements, rtol=self.rtol, atol=atol, effort=step.effort)
 
     def _by_element(self, step: Step, elements: Elements, threads: int) -> tuple[Array, Array]:
         term, part = step.term, step.part
@@ -151,3 +181,9 @@ class Run:
                 features.append((math.pi / 2 - cap.half_angle, 0.02))  # the rim sets
         upper = radial.tau_of_slope(self.gradients.steepest)
         return radial.tabulate(profile, upper, rtol=self.rtol, atol=self.atol, features=features)
+
+
+def _largest(error: Array, value: Array, negligible: float) -> float:
+    """Largest relative error, of errors that are not negligible."""
+    counts = (error > negligible) & (value != 0.0)
+    return float(np.max(np.divide(error, np.abs(value), out=np.zeros_like(error), where=counts), initial=0.0))

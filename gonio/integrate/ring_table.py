@@ -1,11 +1,7 @@
-"""R(theta_n, phi_n) of a whole map: Chebyshev polynomials of tau = tan(theta_n / 2) on pieces, a grid of azimuths, Lagrange.
+"""R(theta_n, phi_n) of a whole map: Chebyshev polynomials of tau = tan(theta_n / 2) on pieces, Fourier series in phi_n.
 
 Pieces are halved, and their sums made with more digits or waves, until slopes and azimuths between the nodes agree.
-
-References
-----------
-.. [1] J. P. Boyd, "A fast algorithm for Chebyshev, Fourier, and sinc interpolation onto an irregular grid", J. Comput. Phys.
-   103, 1992 (oversampling, then local interpolation).
+`ring_patches` reads the map then.
 """
 
 from __future__ import annotations
@@ -14,82 +10,19 @@ import functools
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio import jit
-from gonio.integrate import threads
+from gonio.integrate.ring_patches import Room, Table, patches
 from gonio.integrate.ring_scene import MOST_DIGITS, Scene, first_digits, floor_of, on_azimuths, tail_of, truncated
 
 Array = NDArray[np.float64]
 _DEGREE = 15
-_OVERSAMPLING = 4
 _SAFETY = 3.0
 _MOST_PIECES = 200
 _DEEPEST = 24
-
-
-def _read(tau, phi, bounds, errors, table, value, error):  # type: ignore[no-untyped-def]
-    """Value and error at each gradient: Chebyshev in tau, Lagrange in phi on a periodic grid."""
-    pieces, degree, columns = table.shape[0], table.shape[1] - 1, table.shape[2] - 9
-    per_radian = columns / (2.0 * math.pi)
-    cheb, lagrange, line = np.empty(degree + 1), np.empty(10), np.empty(10)
-    for k in range(tau.size):
-        low, high = 0, pieces
-        while high - low > 1:
-            middle = (low + high) // 2
-            if tau[k] >= bounds[middle]:
-                low = middle
-            else:
-                high = middle
-        x = (2.0 * tau[k] - bounds[low] - bounds[low + 1]) / (bounds[low + 1] - bounds[low])
-        cheb[0], cheb[1] = 1.0, x
-        for j in range(2, degree + 1):
-            cheb[j] = 2.0 * x * cheb[j - 1] - cheb[j - 2]
-        at = phi[k] * per_radian
-        at -= columns * math.floor(at / columns)
-        column = int(at)
-        if column >= columns:
-            column = columns - 1
-        u = at - column + 4.0  # 4 to 5 of the ten points 0 to 9
-        # w_j = prod_{i != j} (u - i) / (j - i), from products of the differences on either side
-        left = 1.0
-        for j in range(10):
-            lagrange[j] = left
-            left *= u - j
-        right = 1.0
-        for j in range(9, -1, -1):
-            lagrange[j] *= right
-            right *= u - j
-        lagrange[0] *= -1.0 / 362880.0
-        lagrange[1] *= 1.0 / 40320.0
-        lagrange[2] *= -1.0 / 10080.0
-        lagrange[3] *= 1.0 / 4320.0
-        lagrange[4] *= -1.0 / 2880.0
-        lagrange[5] *= 1.0 / 2880.0
-        lagrange[6] *= -1.0 / 4320.0
-        lagrange[7] *= 1.0 / 10080.0
-        lagrange[8] *= -1.0 / 40320.0
-        lagrange[9] *= 1.0 / 362880.0
-        for i in range(10):
-            line[i] = 0.0
-        for j in range(degree + 1):
-            c = cheb[j]
-            row = table[low, j, column : column + 10]
-            for i in range(10):
-                line[i] += c * row[i]
-        total = 0.0
-        for i in range(10):
-            total += lagrange[i] * line[i]
-        value[k] = total
-        error[k] = errors[low]
-
-
-@functools.cache
-def _reader() -> Any:
-    return jit.kernel(_read)
+_PATCHING = 0.05  # of the tolerance, for reading between the nodes
 
 
 @functools.cache
@@ -118,17 +51,31 @@ class _Trial:
 
     series: Array
     error: float
+    allowed: float
     good: bool
     digits_short: float
     waves_short: bool
     too_long: bool
 
 
-def by_table(scene: Scene, tau: Array, phi: Array, rtol: float, atol: Array) -> tuple[Array, Array]:
-    lowest, highest = float(tau.min()), float(tau.max())
-    highest = max(highest, lowest * (1.0 + 1e-12) + 1e-300)
+def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
+    """The map for all slopes in a range.
+
+    Parameters
+    ----------
+    scene : Scene
+    rtol : float
+    room : Room
+        The range, and what absolute errors are allowed in it.
+
+    Returns
+    -------
+    Table
+        With its honest errors, whether or not they are within the tolerance.
+    """
+    lowest = room.lowest
+    highest = max(room.highest, lowest * (1.0 + 1e-12) + 1e-300)
     digits = first_digits(rtol)
-    room = _Room(tau, atol)
     waves, scale = _waves(scene, lowest, highest, digits, rtol, room)
     count = max(1, math.ceil((highest - lowest) * min(waves, 64) / 9.0))
     edges = np.linspace(lowest, highest, count + 1)
@@ -156,22 +103,12 @@ def by_table(scene: Scene, tau: Array, phi: Array, rtol: float, atol: Array) -> 
                 pending.append(better)
     done.sort(key=lambda item: item[0].lower)
     bounds = np.array([piece.lower for piece, _ in done] + [highest])
-    errors = np.array([trial.error for _, trial in done])
-    columns = _columns(max(piece.waves for piece, _ in done))
-    table = np.array([_padded(on_azimuths(trial.series, columns)) for _, trial in done])
-    return _evaluate(bounds, errors, table, tau, phi, scene.threads)
+    read = [patches(trial.series, _PATCHING * max(trial.allowed, trial.error)) for _, trial in done]
+    errors = np.array([trial.error + patch.error for (_, trial), patch in zip(done, read, strict=True)])
+    return Table.of(bounds, errors, read)
 
 
-def _columns(waves: int) -> int:
-    return 1 << max(5, math.ceil(math.log2(2 * _OVERSAMPLING * waves)))
-
-
-def _padded(table: Array) -> Array:
-    """The periodic grid with the points that Lagrange's formula needs beyond its ends."""
-    return np.concatenate((table[:, -4:], table, table[:, :5]), axis=1)
-
-
-def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: _Room, resolution: float) -> list[_Trial]:
+def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution: float) -> list[_Trial]:
     """Sums on pieces of equal digits and waves, and their errors at slopes and azimuths between the nodes."""
     digits, waves = pieces[0].digits, pieces[0].waves
     nodes, probes, matrix = _chebyshev()
@@ -182,21 +119,16 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: _Room, resolutio
     more = min(scene.rings.waves, max(waves + max(8, waves // 3), scene.first_waves if scene.rows else 0))
     all_fine = scene.sums(at_probes.ravel(), digits + 3.0, more).reshape(len(pieces), len(probes), 3, more)
     all_rough = scene.sums(at_probes.ravel(), digits, waves).reshape(len(pieces), len(probes), 3, waves)
-    columns = _columns(waves)
-    between = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
+    between = np.polynomial.chebyshev.chebvander(probes, _DEGREE)
+    columns = 1 << max(5, math.ceil(math.log2(8 * waves)))
     trials = []
     for k, piece in enumerate(pieces):
         nodal, fine, rough = all_nodal[k], all_fine[k], all_rough[k]
         exact = on_azimuths(fine, columns, 0.5)
         series = np.tensordot(matrix, nodal[:, :2], axes=1)
-        grid = on_azimuths(series, columns)
-        got, _ = _evaluate(
-            np.array([piece.lower, piece.upper]), np.zeros(1), _padded(grid)[None],
-            np.repeat(at_probes[k], columns), np.tile(between, len(probes)), 1,
-        )  # fmt: skip
-        missed = float(np.max(np.abs(got.reshape(exact.shape) - exact)))
+        missed = float(np.max(np.abs(on_azimuths(np.tensordot(between, series, axes=1), columns, 0.5) - exact)))
         if scene.rows:  # the series converges slowly where the horizon or the lobe crosses rows: doubt more than the probes
-            missed = max(missed, 0.5 * float(np.max(np.sum(np.abs(grid[-3:]), axis=0))))
+            missed = max(missed, 0.5 * float(np.max(np.sum(np.abs(on_azimuths(series[-3:], columns)), axis=0))))
         lost, tail = float(np.max(truncated(fine, waves))), float(np.max(tail_of(fine, scene.rings)))
         common = fine[..., :waves] - rough
         quadrature = float(np.max(np.abs(on_azimuths(common, columns))))
@@ -208,7 +140,8 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: _Room, resolutio
             _Trial(
                 series,
                 error,
-                error <= allowed,
+                allowed,
+                error <= (1.0 - _PATCHING) * allowed,
                 math.log10(max(quadrature / allowed, 1e-300)) if missed > quadrature else 2.0,
                 lost + tail > 0.2 * allowed and waves < scene.rings.waves,
                 missed > quadrature + 2.0 * lost,
@@ -217,27 +150,11 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: _Room, resolutio
     return trials
 
 
-class _Room:
-    """Absolute tolerances of the elements, by slope."""
-
-    def __init__(self, tau: Array, atol: Array) -> None:
-        self._order = np.argsort(tau, kind="stable") if np.any(atol > 0.0) else None
-        if self._order is not None:
-            self._tau, self._atol = tau[self._order], atol[self._order]
-
-    def smallest(self, lower: float, upper: float) -> float:
-        """Of the elements with slopes in the interval; 0 without tolerances."""
-        if self._order is None:
-            return 0.0
-        first, last = np.searchsorted(self._tau, (lower, upper))
-        return float(self._atol[max(0, first - 1) : last + 1].min())
-
-
 def _within(piece: _Piece, x: Array) -> Array:
     return piece.lower + (piece.upper - piece.lower) * (x + 1.0) / 2.0
 
 
-def _waves(scene: Scene, lowest: float, highest: float, digits: float, rtol: float, room: _Room) -> tuple[int, float]:
+def _waves(scene: Scene, lowest: float, highest: float, digits: float, rtol: float, room: Room) -> tuple[int, float]:
     """How many waves R has, from a few slopes, and its largest value there."""
     at = lowest + (highest - lowest) * np.array([0.02, 0.2, 0.4, 0.6, 0.8, 0.98])
     spare = np.array([room.smallest(t, t) for t in at])
@@ -253,13 +170,3 @@ def _waves(scene: Scene, lowest: float, highest: float, digits: float, rtol: flo
         if np.all(truncated(sums, fewer) + tail_of(sums, scene.rings) <= wanted):
             return fewer + 2, float(values.max())
     return waves, float(values.max())
-
-
-def _evaluate(bounds: Array, errors: Array, table: Array, tau: Array, phi: Array, cores: int) -> tuple[Array, Array]:
-    value, error = np.empty(len(tau)), np.empty(len(tau))
-
-    def work(tile: slice) -> None:
-        _reader()(tau[tile], phi[tile], bounds, errors, table, value[tile], error[tile])
-
-    threads.run(work, [slice(k, k + 8192) for k in range(0, len(tau), 8192)], cores)
-    return value, error

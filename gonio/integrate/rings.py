@@ -1,9 +1,8 @@
 r"""Maps of an isotropic BRDF under any radiance field, seen along the view axis: R(theta_n, phi_n) as one smooth table.
 
 `ring_kernel` gives, for one slope, R as a Fourier series in phi_n. A few gradients are summed from it. For a map the
-slopes are tabulated, piecewise by Chebyshev polynomials of tau = tan(theta_n / 2), which is algebraic in the gradient and
-regular to 90 degrees, and the series on a fine grid of azimuths, from which Lagrange's formula reads any phi_n: the cost of
-a gradient does not depend on BRDF and field.
+slopes are tabulated (`ring_table`), piecewise by Chebyshev polynomials of tau = tan(theta_n / 2), which is algebraic in the
+gradient and regular to 90 degrees, and read by `ring_patches`: the cost of a gradient does not depend on BRDF and field.
 
 The error of a piece is that of the table at slopes and azimuths between its nodes, against sums with more digits and more
 waves, times a safety factor; plus that of the field's own series, and rounding.
@@ -18,51 +17,19 @@ from gonio.brdf.base import Term
 from gonio.fields import EnvironmentMap, Field
 from gonio.integrate import threads
 from gonio.integrate.frames import Elements
+from gonio.integrate.grid import Gradients
 from gonio.integrate.quadrature import Effort
 from gonio.integrate.ring_scene import FIRST_WAVES, MOST_DIGITS, NONE, Scene, first_digits, floor_of, tail_of
-from gonio.integrate.ring_table import by_table
 from gonio.integrate.spectrum import spectrum
 
 Array = NDArray[np.float64]
 FEW = 96  # distinct slopes up to which each is summed by itself
 
 
-def integrate_rings(
-    term: Term,
-    field: Field,
-    elements: Elements,
-    *,
-    rtol: float,
-    atol: float | Array,
-    effort: Effort,
-    cores: int | None = None,
-) -> tuple[Array, Array]:
-    """Reflected radiance of each element due to one isotropic term and one field.
-
-    Parameters
-    ----------
-    term : Term
-        For which `applies` holds.
-    field : Field
-    elements : Elements, length n
-        Seen along the view axis.
-    rtol : float
-    atol : float or ndarray, shape (n,)
-        Tolerance per element. An element that does not reach it keeps its honest error.
-    effort : Effort
-        Added to.
-    cores : int, optional
-        Threads; all cores without it. The result does not depend on it.
-
-    Returns
-    -------
-    value, error : ndarray, shape (n,)
-        [W m^-2 sr^-1].
-    """
-    tau = elements.sin_theta / (1.0 + elements.cos_theta)
-    phi = np.arctan2(elements.sin_phi, elements.cos_phi)
+def scene_of(term: Term, field: Field, rtol: float, effort: Effort, cores: int | None) -> Scene:
+    """One isotropic, compiled term and one field, with the field's waves to a millionth of the tolerance."""
     columns = field.samples.shape[1] if isinstance(field, EnvironmentMap) else 0
-    scene = Scene(
+    return Scene(
         term,
         spectrum(field, max(1e-6 * rtol, 1e-14)),
         isinstance(field, EnvironmentMap),
@@ -72,11 +39,37 @@ def integrate_rings(
         # of a map beyond the first copy of its spectrum, as what its kinks add starts there
         max(FIRST_WAVES, min(400, 3 * columns // 2)),
     )
-    allowed = np.broadcast_to(np.asarray(atol, dtype=float), tau.shape)
-    if len(tau) <= FEW or len(slopes := np.unique(tau)) <= FEW:
-        slopes, where = np.unique(tau, return_inverse=True)
-        return _directly(scene, slopes, where, phi, rtol, allowed)
-    return by_table(scene, tau, phi, rtol, allowed)
+
+
+def slopes_are_few(gradients: Gradients) -> bool:
+    """Whether each slope is better summed by itself."""
+    if gradients.size <= FEW:
+        return True
+    start = gradients.elements(0, min(gradients.size, 4 * FEW))  # which tells for nearly all lists
+    return len(np.unique(start.cos_theta)) <= FEW and len(np.unique(gradients.elements().cos_theta)) <= FEW
+
+
+def integrate_rings(scene: Scene, elements: Elements, *, rtol: float, atol: float | Array) -> tuple[Array, Array]:
+    """Reflected radiance of each element, slope by slope.
+
+    Parameters
+    ----------
+    scene : Scene
+    elements : Elements, length n
+        Seen along the view axis.
+    rtol : float
+    atol : float or ndarray, shape (n,)
+        Tolerance per element. An element that does not reach it keeps its honest error.
+
+    Returns
+    -------
+    value, error : ndarray, shape (n,)
+        [W m^-2 sr^-1].
+    """
+    tau = elements.sin_theta / (1.0 + elements.cos_theta)
+    phi = np.arctan2(elements.sin_phi, elements.cos_phi)
+    slopes, where = np.unique(tau, return_inverse=True)
+    return _directly(scene, slopes, where, phi, rtol, np.broadcast_to(np.asarray(atol, dtype=float), tau.shape))
 
 
 def _series(sums: Array, phi: Array) -> Array:
