@@ -94,7 +94,7 @@ def measure(run: Run, output: Output) -> None:
             rig = stack.enter_context(open_rig(rig_of(run), ask=ask(output), faults=not begun))
         with _stages(output) as progress:
             result = scan(run, rig, progress=progress)
-    output.say(f"{result.done} of {result.poses} poses taken in {result.seconds:.0f} s of rig time")
+    output.say(f"{result.done} of {result.poses} poses taken in {result.seconds:.0f} s by the rig's clock")
     if result.repeated:
         output.say(f"{result.repeated} exposures were taken again because an axis moved")
     if result.saturated:
@@ -137,9 +137,11 @@ def ask(output: Output) -> Callable[[str], None] | None:
 def show_preflight(output: Output, checked: Preflight) -> None:
     """What a scan would do."""
     plan = checked.plan
+    hurried = f" ({checked.speed:g} times as fast on this simulated rig)" if checked.speed != 1.0 else ""
     output.say(
-        f"{len(plan.poses)} poses, {checked.frames} frames, {checked.bytes / 1e6:.0f} MB, {checked.seconds:.0f} s of rig "
-        f"time ({checked.seconds / checked.speed:.0f} s on the wall's clock)"
+        f"{len(plan.poses)} poses, {checked.frames} frames, {checked.bytes / 1e6:.0f} MB; about {checked.wall_s:.0f} s: "
+        f"{checked.seconds:.0f} s of motion, exposure and rest{hurried}, and {checked.host_s:.0f} s of bus, camera and disk, "
+        f"if they take {1e3 * checked.host_s / max(1, len(plan.poses)):.0f} ms a pose"
     )
     for kind, count, first in checked.reasons():
         output.say(f"{count} geometries are left out: {kind} (the first: {first.reasons[0]})")

@@ -158,6 +158,8 @@ def test_preflight_counts_and_refuses() -> None:
     assert checked.white_blocks == 2
     assert checked.frames == (len(plan.poses) + 2 * 4 + 8) * 3
     assert checked.seconds == pytest.approx(checked.move_s + checked.expose_s + checked.reference_s)
+    # the simulated rig hurries 40 times; what the computer itself has to do takes its time
+    assert checked.wall_s == pytest.approx(checked.seconds / 40 + 0.025 * len(plan.poses))
     every = config.parse_plan(config.small_plan().replace("every = 0", "every = 10"))
     assert check(plan, every, RIG).white_blocks == 2 + (len(plan.poses) - 1) // 10
     narrow = config.parse_rig(TEXTS["rig.toml"].replace("upper_deg = 100.0", "upper_deg = 50.0"))
