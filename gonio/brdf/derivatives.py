@@ -5,7 +5,8 @@ computed, to the last digits, at the ends of the parameters' ranges too. Numbers
 enter by the chain rule. What cannot be rewritten, and the derived numbers themselves, are differentiated by interpolation
 between values inside the parameter's range.
 
-At an end of a range the derivative is one-sided; where it is infinite, so is the number given. It is never NaN.
+At an end of a range the derivative is one-sided; where it is infinite, so is the number given, but for differences, which
+are then merely large. It is never NaN.
 
 References
 ----------
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 NODES, LEVELS = 13, 10  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
-_STEEPER = 1.3  # growth from one length to the next, again and again, of a derivative that is infinite at the range's end
+_STEEPER = 3.0  # growth towards the end of a range of a derivative that is infinite there; a root's is 10
 _ENOUGH = 1e-13  # relative change from one length to the next at which no shorter one is tried
 
 
@@ -60,12 +61,36 @@ def _of_term(term: Term, omega_i: Array, omega_r: Array) -> Array:
     out = np.zeros((k, len(omega_i)))
     if how(model) == "automatic":
         _filling(model.function)(omega_i, omega_r, p, seeds(model, p), term.weight, out)
-        lost = np.flatnonzero(np.isnan(out).any(axis=0))  # an infinity met a zero on the way
-        if lost.size:
-            again = _differences(term, omega_i[lost], omega_r[lost])
-            out[:, lost] = np.where(np.isnan(out[:, lost]), again, out[:, lost])
+        for j in np.flatnonzero(np.isnan(out).any(axis=1)):  # an infinity met a zero or another one on the way
+            lost = np.isnan(out[j])
+            out[j, lost] = _beside(term, int(j), omega_i[lost], omega_r[lost])
         return out
     return _differences(term, omega_i, omega_r)
+
+
+def _beside(term: Term, j: int, omega_i: Array, omega_r: Array) -> Array:
+    """Derivative (n,) by parameter j at the end of its range, as the limit from inside."""
+    model, k = term.model, len(term.model.parameters)
+    parameter = model.parameters[j]
+    inward = 1.0 if term.values[j] < 0.5 * (parameter.lower + parameter.upper) else -1.0
+    near = []
+    for share in (1e-12, 1e-14):
+        p = term.values[:k].copy()
+        p[j] += inward * share * _scale(parameter, float(p[j]))
+        p, out = model.complete(p), np.zeros((1, len(omega_i)))
+        _filling(model.function)(omega_i, omega_r, p, seeds(model, p)[j : j + 1], term.weight, out)
+        near.append(out[0])
+    far, close = near
+    limit = np.where(np.abs(close) > _STEEPER * np.abs(far), np.copysign(np.inf, close), close)
+    again = _differences(term, omega_i, omega_r)[j] if np.isnan(limit).any() else limit
+    return np.asarray(np.where(np.isnan(limit), again, limit))
+
+
+def _scale(parameter: Parameter, x: float) -> float:
+    """How far a parameter has to move to matter."""
+    kind, a, b = parameter.prior
+    wide = b - a if kind == "uniform" else max(abs(x), float(np.exp(a - 3.0 * b)))
+    return min(wide, parameter.upper - parameter.lower)
 
 
 @functools.cache
@@ -128,10 +153,8 @@ def differentiate(function: Callable[[float], Array], x: float, parameter: Param
     Polynomials through Chebyshev nodes on shorter and shorter intervals around x, one-sided where the range ends; of
     each number the derivative counts that changed least from one interval to the next.
     """
-    span, (kind, a, b) = parameter.upper - parameter.lower, parameter.prior
-    scale = b - a if kind == "uniform" else max(abs(x), float(np.exp(a - 3.0 * b)))
-    half = 0.25 * min(scale, span)
-    best = last = error = grown = np.zeros(0)
+    half = 0.25 * _scale(parameter, x)
+    best = last = error = np.zeros(0)
     for level in range(LEVELS):
         nodes, weights = _rule(x, max(parameter.lower, x - half), min(parameter.upper, x + half))
         values = np.array([function(float(t)) for t in nodes])
@@ -139,17 +162,15 @@ def differentiate(function: Callable[[float], Array], x: float, parameter: Param
             return np.zeros(values.shape[1])
         now = weights @ (values - values[nodes == x])
         if level == 0:
-            best, error, grown = now, np.full(len(now), np.inf), np.zeros(len(now))
+            best, error = now, np.full(len(now), np.inf)
         else:
             change = np.abs(now - last)
             best = np.where(change < error, now, best)
             error = np.minimum(error, change)
-            grown = np.where(np.abs(now) > _STEEPER * np.abs(last), grown + 1, 0)
             if np.all(error <= _ENOUGH * np.max(np.abs(best), initial=0.0)):
                 break
         last, half = now, 0.25 * half
-    infinite = (grown >= LEVELS // 2) & (x in (parameter.lower, parameter.upper))  # a root's slope doubles with each length
-    return np.where(infinite, np.copysign(np.inf, last), best)
+    return best
 
 
 def _rule(x: float, lower: float, upper: float) -> tuple[Array, Array]:
