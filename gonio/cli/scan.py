@@ -140,8 +140,8 @@ def show_preflight(output: Output, checked: Preflight) -> None:
     hurried = f" ({checked.speed:g} times as fast on this simulated rig)" if checked.speed != 1.0 else ""
     output.say(
         f"{len(plan.poses)} poses, {checked.frames} frames, {checked.bytes / 1e6:.0f} MB; about {checked.wall_s:.0f} s: "
-        f"{checked.seconds:.0f} s of motion, exposure and rest{hurried}, and {checked.host_s:.0f} s of bus, camera and disk, "
-        f"if they take {1e3 * checked.host_s / max(1, len(plan.poses)):.0f} ms a pose"
+        f"{checked.seconds:.0f} s of motion, exposure and rest{hurried}, and {checked.host_s:.0f} s of bus, camera and "
+        f"disk, if they take {1e3 * checked.host_s / max(1, len(plan.poses)):.0f} ms a pose"
     )
     for kind, count, first in checked.reasons():
         output.say(f"{count} geometries are left out: {kind} (the first: {first.reasons[0]})")

@@ -84,11 +84,14 @@ def load_posterior(run: Run) -> Posterior:
 
 
 def fit(run: Run, output: Output, model: str, seed: int, **options: Any) -> Posterior:
-    """Samples to a posterior, written as posterior.nc."""
+    """Samples to a posterior, written as posterior.nc; angles among the options as a user writes them, in degrees."""
     from fitting import fit as run_fit
+    from gonio.cli.units import angles_of_fit, fit_options
 
+    samples = run.read_samples()
+    options = fit_options(options, angles_of_fit(model, samples))
     with output.stage("fit") as progress:
-        posterior = run_fit(run.read_samples(), model, seed=seed, progress=progress, **options)
+        posterior = run_fit(samples, model, seed=seed, progress=progress, **options)
         posterior.save(run.posterior_path)
     status = posterior.diagnostics
     log.info("fit %s: %s", model, {k: v for k, v in status.items() if isinstance(v, str | bool | int | float)})

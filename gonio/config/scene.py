@@ -101,13 +101,26 @@ class BRDFConfig:
         from gonio.brdf.families import find
 
         where = f"{self.where} {name}"
-        choices = {key: value for key, value in written.items() if isinstance(value, str | bool)}
-        if choices:
+        family = find(model.name)
+        chosen: dict[str, object] = {}
+        numbers: dict[str, float] = {}
+        for key, value in written.items():
+            if key in family.choices:
+                chosen[key] = value if isinstance(value, str | bool) else f"{value:g}"  # a year may be written as a number
+            elif isinstance(value, str | bool):
+                known = [*family.choices, *map(written_name, model.parameters)]
+                if key in known:
+                    raise ConfigurationError(f"{where}: {key} is {value!r}; it must be a number without quotes")
+                raise ConfigurationError(
+                    f"{where} has no {key!r}{suggestion(key, known)}; it has: {', '.join(known) or 'nothing to set'}"
+                )
+            else:
+                numbers[key] = value
+        if chosen:
             try:
-                model = find(model.name).model(**{**model.choices, **choices})
+                model = family.model(**{**model.choices, **chosen})
             except ParameterError as exc:
                 raise ConfigurationError(f"{where}: {exc}") from exc
-        numbers = {key: float(value) for key, value in written.items() if not isinstance(value, str | bool)}
         values = read_parameters(numbers, model, where)
         try:
             return brdf.Term(model, model.values(values))
