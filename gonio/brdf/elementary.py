@@ -12,6 +12,7 @@ References
 .. [1] P.-T. P. Tang, "Table-driven implementation of the exponential function in IEEE floating-point arithmetic", ACM Trans.
    Math. Softw. 15(2), 1989; "... of the logarithm function ...", 16(4), 1990, on the reduction in two parts.
 .. [2] FreeBSD msun, e_log.c (Sun Microsystems, 1993): the form of the logarithm and its polynomial of error 2^-58.
+.. [3] T. Ogita, S. M. Rump, S. Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005 (Dekker's product).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _LOG2_E = 1.0 / math.log(2.0)
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # the first has 21 zero bits at its end
 _ROOT_HALF_BITS = int(np.float64(math.sqrt(0.5)).view(np.int64))
 _SMALLEST = 2.0**-1022
+_SPLITTER = 2.0**27 + 1.0
 
 
 @jit.model
@@ -95,3 +97,23 @@ def power(x: float, y: float) -> float:
     logarithm = log(x)
     value: float = exp(y * (logarithm if logarithm > -math.inf else -1e308))  # 0^0 = 1
     return value
+
+
+@jit.model
+def two_products(a: float, b: float, c: float, d: float) -> float:
+    """a b + c d to 1 eps where the two cancel to no less than 1e-15 of each: with the products' rounding errors [3]_."""
+    ab, cd = a * b, c * d
+    t = _SPLITTER * a
+    a_high = t - (t - a)
+    t = _SPLITTER * b
+    b_high = t - (t - b)
+    t = _SPLITTER * c
+    c_high = t - (t - c)
+    t = _SPLITTER * d
+    d_high = t - (t - d)
+    a_low, b_low, c_low, d_low = a - a_high, b - b_high, c - c_high, d - d_high
+    rest_ab = a_low * b_low - (((ab - a_high * b_high) - a_low * b_high) - a_high * b_low)
+    rest_cd = c_low * d_low - (((cd - c_high * d_high) - c_low * d_high) - c_high * d_low)
+    total = ab + cd
+    t = total - ab
+    return total + (((ab - (total - t)) + (cd - t)) + (rest_ab + rest_cd))

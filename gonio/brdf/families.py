@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from gonio.brdf.base import Model, _suggest
+from gonio.brdf.blinn import ASHIKHMIN_SHIRLEY, BLINN_PHONG
 from gonio.brdf.eon import EON
 from gonio.brdf.hapke import hapke
 from gonio.brdf.kubelka_munk import KUBELKA_MUNK
@@ -19,9 +20,11 @@ from gonio.brdf.lommel_seeliger import LOMMEL_SEELIGER
 from gonio.brdf.microfacet import GGX
 from gonio.brdf.minnaert import MINNAERT
 from gonio.brdf.oren_nayar import OREN_NAYAR, OREN_NAYAR_FULL
-from gonio.brdf.phong import PHONG
+from gonio.brdf.phong import LAFORTUNE, PHONG
 from gonio.brdf.plastic import PLASTIC
+from gonio.brdf.scatter import ABG, HARVEY_SHACK, K_CORRELATION
 from gonio.brdf.specular import SPECULAR
+from gonio.brdf.ward import WARD
 from gonio.errors import ParameterError
 
 ENTRY_POINTS = "gonio.brdf_models"
@@ -87,6 +90,13 @@ FAMILIES: dict[str, Family] = {
         single(KUBELKA_MUNK),
         single(PLASTIC),
         single(PHONG),
+        single(BLINN_PHONG),
+        single(LAFORTUNE),
+        Family("ward", lambda variant: WARD[variant], {"variant": ("ward", "duer", "gmd")}),
+        single(ASHIKHMIN_SHIRLEY),
+        single(ABG),
+        single(HARVEY_SHACK),
+        single(K_CORRELATION),
         single(GGX),
         single(SPECULAR),
     )
