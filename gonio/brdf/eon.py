@@ -15,8 +15,8 @@ with :math:`A = 1/(1+K_1 r)`, :math:`K_1 = \tfrac12-\tfrac{2}{3\pi}`, :math:`K_2
           G = \sigma(\theta - \sigma\mu) + \tfrac23\Bigl(\frac{\sigma}{\mu}(1-\sigma^3) - \sigma\Bigr) .
 
 Here :math:`1-E = A r D` with :math:`D = K_1 - G/\pi`, so that r = 0 is Lambert's surface without a special case, and
-D is written in :math:`\mu` and the elevation :math:`\arcsin\mu`, in which it vanishes at the horizon digit by digit. At
-albedo 1 the directional albedo is exactly 1.
+D is written in :math:`\mu` and the elevation :math:`\arcsin\mu`, in which it vanishes at the horizon digit by digit; so does
+1 + s where it comes near 0. At albedo 1 the directional albedo is exactly 1.
 
 References
 ----------
@@ -44,7 +44,8 @@ def _left(mu: float, sine2: float) -> float:
     """D = (1 - E) / (A r), from mu and sin^2 theta."""
     s = math.sqrt(sine2)
     grazing = _CAP * mu / (1.0 + s) + s * s - (2.0 / 3.0) * s * (1.0 + s + s * s) / (1.0 + s)
-    return INV_PI * (mu * grazing + s * arctan(mu, s))
+    d: float = INV_PI * (mu * grazing + s * arctan(mu, s))
+    return d
 
 
 @jit.model
@@ -56,12 +57,15 @@ def eon_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p:
     a = 1.0 / (1.0 + K_1 * r)
     s = xi * xr + yi * yr
     largest = mu_i if mu_i > mu_r else mu_r
-    s = s / (largest if s > 0.0 else 1.0)
+    # 1 + s = (|(wi + wr)_xy|^2 + mu_i^2 + mu_r^2) / 2
+    x, y = xi + xr, yi + yr
+    behind = 1.0 - r + r * 0.5 * (x * x + y * y + mu_i * mu_i + mu_r * mu_r)
+    single = 1.0 + r * s / largest if s > 0.0 else behind
     mean = a * (1.0 + K_2 * r)
     multiple = albedo * mean / (1.0 - albedo * (a * r * (K_1 - K_2)))  # 1 - mean = a r (K_1 - K_2)
     # (1 - E_i) (1 - E_r) / (1 - mean), over a
     again = r / (K_1 - K_2) * _left(mu_i, xi * xi + yi * yi) * _left(mu_r, xr * xr + yr * yr)
-    return albedo * INV_PI * a * (1.0 + r * s + multiple * again) if lit else 0.0
+    return albedo * INV_PI * a * (single + multiple * again) if lit else 0.0
 
 
 EON = Model(

@@ -81,7 +81,8 @@ def h_2002(x: float, w: float) -> float:
     gamma = math.sqrt(1.0 - w)
     r_0 = w / ((1.0 + gamma) * (1.0 + gamma))
     y = w * x * (r_0 + (0.5 - r_0 * x) * log1p(1.0 / x))
-    return y / (1.0 - y)
+    more: float = y / (1.0 - y)
+    return more
 
 
 @jit.model
@@ -97,7 +98,8 @@ def one_minus_exp(x: float) -> float:
     near = 4.1666666666666664e-02 - x * near
     near = 1.6666666666666666e-01 - x * near
     near = x * (1.0 - x * (0.5 - x * near))
-    return near if x < 0.25 else 1.0 - exp(-x)
+    value: float = near if x < 0.25 else 1.0 - exp(-x)
+    return value
 
 
 def _function(big_h: Any) -> Any:

@@ -18,6 +18,8 @@ References
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,9 +46,16 @@ def collimated(term: Term, beam: Collimated, elements: Elements) -> tuple[Array,
     return value, np.abs(value) * relative
 
 
+def diffuse_albedo(term: Term) -> float:
+    """pi f_r of a diffuse term, times its weight; one number, for which nothing is compiled."""
+    assert term.model.function is not None
+    function = getattr(term.model.function, "py_func", term.model.function)
+    return term.weight * math.pi * float(function(0.0, 0.0, 1.0, 0.0, 0.0, 1.0, term.values))
+
+
 def lambertian_cap(term: Term, cap: Cap, elements: Elements) -> tuple[Array, Array]:
     """14b and 14c: a diffuse surface under a uniform sphere or a uniform hemisphere of any axis."""
-    rho = term.weight * term.values[0]
+    rho = diffuse_albedo(term)
     if cap.half_angle >= np.pi:
         value = np.full(len(elements), rho * cap.radiance)
     else:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from gonio import jit
 from gonio.brdf.base import Term
 from gonio.errors import GeometryError
+from gonio.integrate.closed_forms import diffuse_albedo
 from gonio.integrate.frames import Elements
 from gonio.source import Cap, Collimated
 
@@ -111,7 +112,7 @@ _facing = jit.kernel(_all_facing, fastmath=False)
 
 def add_diffuse(term: Term, cap: Cap, gradients: Gradients, tile: tuple[int, int], value: Array, error: Array) -> float:
     """14b and 14c on one tile: adds value and error; returns the largest relative error."""
-    full = term.weight * float(term.values[0]) * cap.radiance
+    full = diffuse_albedo(term) * cap.radiance
     half = cap.half_angle < math.pi
     a, b = (0.5 * full, 0.5 * full) if half else (full, 0.0)
     _facing(gradients.p, gradients.q, *tile, np.array(cap.axis), a, b, 8.0 * EPS * full, value, error)
