@@ -214,4 +214,4 @@ def directional_albedo(brdf: BRDF, theta_r: ArrayLike, *, rtol: float = 1e-6) ->
     if not np.all((theta >= 0) & (theta < np.pi / 2)):
         raise GeometryError("theta_r must be within 0 and 90 degrees, 90 excluded")
     flat = reflectance_map(brdf, uniform(1.0), np.tan(theta.ravel()), 0.0, rtol=rtol)
-    return Estimate(flat.value.reshape(theta.shape), flat.error.reshape(theta.shape))
+    return Estimate(flat.value.reshape(theta.shape), flat.error.reshape(theta.shape), error_is_bound=flat.error_is_bound)
