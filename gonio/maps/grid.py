@@ -25,6 +25,7 @@ from gonio.errors import DatasetError, GeometryError, IntegrationError, Paramete
 from gonio.files import replace_atomically
 from gonio.integrate import Estimate, MapValues, reflectance_map
 from gonio.maps import surface
+from gonio.maps.band import band_of
 from gonio.maps.interpolation import Interpolant
 from gonio.source import Cap, Collimated, Source
 
@@ -60,6 +61,8 @@ class ReflectanceMap:
         Direction of a viewer off the z axis [rad].
     tangent : float, optional
         Rotation of a grained surface's x axis about its normal [rad], the same for all gradients.
+    band_error : ndarray, shape (m, n), optional
+        Of both ends of the band, as quantiles of the draws it was made of.
     """
 
     p: Array
@@ -74,6 +77,7 @@ class ReflectanceMap:
     source: Source | None = field(default=None, repr=False, compare=False)
     viewer: tuple[float, float] | None = None
     tangent: float | None = None
+    band_error: Array | None = None
 
     @property
     def has_scene(self) -> bool:
@@ -217,6 +221,8 @@ class ReflectanceMap:
         if self.band is not None:
             text = "ends of the pointwise 68 % interval of the posterior"
             data["R_band"] = (("quantile", "q", "p"), self.band, {"long_name": text, **unit})
+        if self.band_error is not None:
+            data["R_band_error"] = (("q", "p"), self.band_error, {"long_name": "error of the band", **unit})
         coordinates: dict[str, Any] = {
             "p": ("p", self.p, {"long_name": "surface gradient dz/dx", "units": "1"}),
             "q": ("q", self.q, {"long_name": "surface gradient dz/dy", "units": "1"}),
@@ -263,6 +269,7 @@ class ReflectanceMap:
                     {str(k): str(v) for k, v in json.loads(data.attrs["attributes"]).items()},
                     viewer=None if viewer is None else (float(viewer[0]), float(viewer[1])),
                     tangent=None if tangent is None else float(tangent),
+                    band_error=data["R_band_error"].to_numpy() if "R_band_error" in data else None,
                 )
         except FileNotFoundError:
             raise DatasetError(f"{path}: there is no such file; make it with: gonio map SCENE.toml --out {path}") from None
@@ -298,10 +305,10 @@ def compute(
     viewer, tangent : optional
         As for `gonio.reflectance_map`; the grain is rotated by the same angle [rad] at all gradients.
     draws : iterable of BRDF, optional
-        Posterior draws; the band is their pointwise 16 and 84 % quantile.
+        Posterior draws; the band is their pointwise 16 and 84 % quantile (`gonio.maps.band`).
     attributes : mapping, optional
     progress : callable, optional
-        Called with the number of draws done.
+        Called with rising numbers; the last is that of the draws.
     tolerant : bool, optional
         Keep a map whose tolerance was not met, with its honest ``error``, instead of raising.
 
@@ -320,16 +327,21 @@ def compute(
     source, p_all, q_all = Source.of(source), p[None, :], q[:, None]
     scene: dict[str, Any] = {"atol": atol, "viewer": viewer, "tangent": tangent}
     values = _evaluate(brdf, source, p_all, q_all, tolerant, rtol=rtol, **scene)
-    stack = []
-    for count, draw in enumerate(draws, 1):
-        stack.append(_evaluate(draw, source, p_all, q_all, True, rtol=max(rtol, _BAND_RTOL), **scene).value)
-        if progress is not None:
-            progress(count)
-    band = np.quantile(np.array(stack), _QUANTILES, axis=0) if stack else None
+    coarse = {**scene, "rtol": max(rtol, _BAND_RTOL)}
+    sample = list(draws)
+    band = None
+    if sample:
+        band = band_of(
+            sample,
+            _QUANTILES,
+            lambda draw: _evaluate(draw, source, p_all, q_all, True, **coarse),
+            rtol=coarse["rtol"],
+            progress=progress,
+        )
     facing = tuple((-axis[0] / axis[2], -axis[1] / axis[2]) for axis in _small_sources(source) if axis[2] > 0)
     made = ReflectanceMap(
-        p, q, values.value, values.error, band, tuple(values.impulses), facing, dict(attributes or {}), brdf, source,
-        viewer, tangent,
+        p, q, values.value, values.error, None if band is None else band.value, tuple(values.impulses), facing,
+        dict(attributes or {}), brdf, source, viewer, tangent, None if band is None else band.error,
     )  # fmt: skip
     return made, values
 

@@ -22,6 +22,8 @@ class Band:
     ----------
     banded, single : float
         Within a band; as a map of its own at the same tolerance.
+    error : float
+        Largest error of an end of the band, relative to the width of the band.
     """
 
     light: str
@@ -29,6 +31,7 @@ class Band:
     n: int
     banded: float
     single: float
+    error: float
 
 
 def measure(light: str, *, quick: bool) -> Band:
@@ -41,13 +44,16 @@ def measure(light: str, *, quick: bool) -> Band:
         for a, b, c in rng.normal(size=(draws, 3))
     ]
     source, axis = Scene("ggx 0.1", light).source(), np.linspace(-3, 3, n)
-    gonio.reflectance_map(brdfs[0], source, axis[None, ::8], axis[::8, None], rtol=1e-4)
+    maps.compute(brdfs[0], source, axis[::16], axis[::16], rtol=1e-4, draws=brdfs[:5], tolerant=True)
     single = np.inf
     for brdf in brdfs[:3]:
         start = time.perf_counter()
         gonio.reflectance_map(brdf, source, axis[None, :], axis[:, None], rtol=1e-4)
         single = min(single, time.perf_counter() - start)
     start = time.perf_counter()
-    maps.compute(brdfs[0], source, axis, axis, rtol=1e-4, draws=brdfs, tolerant=True)
+    made, _ = maps.compute(brdfs[0], source, axis, axis, rtol=1e-4, draws=brdfs, tolerant=True)
     whole = time.perf_counter() - start - single
-    return Band(light, draws, n, whole / (draws * n * n) * 1e9, single / (n * n) * 1e9)
+    assert made.band is not None and made.band_error is not None
+    width = made.band[1] - made.band[0]
+    error = float(np.max(np.divide(made.band_error, width, out=np.zeros_like(width), where=width > 0.0)))
+    return Band(light, draws, n, whole / (draws * n * n) * 1e9, single / (n * n) * 1e9, error)

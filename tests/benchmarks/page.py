@@ -141,10 +141,11 @@ def start(s: Start) -> str:
 
 def bands(found: Sequence[Band]) -> str:
     rows = [
-        [f"ggx 0.2 + {b.light}", str(b.draws), f"{b.n}^2", _two(b.banded), _two(b.single), f"{b.single / b.banded:.1f}"]
+        [f"ggx 0.2 + {b.light}", str(b.draws), f"{b.n}^2", _two(b.banded), _two(b.single), f"{b.single / b.banded:.1f}",
+         f"{b.error:.0e}"]
         for b in found
-    ]
-    head = ["scene, rtol 1e-4", "draws", "gradients", "ns per draw and gradient", "as single maps", "gain"]
+    ]  # fmt: skip
+    head = ["scene, rtol 1e-4", "draws", "gradients", "ns per draw and gradient", "as single maps", "gain", "error / width"]
     return table(head, rows)
 
 
