@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
+from gonio.brdf import plugins
 from gonio.brdf.base import BRDF, Model, Parameter, Term, term_names
 from gonio.brdf.families import FAMILIES, Family, find, parse
 from gonio.brdf.function import from_function
+from gonio.errors import ParameterError
 
 __all__ = ["BRDF", "Family", "Model", "Parameter", "Term", "from_function", "make", "models", "parse", "term_names"]
 
 
 def models() -> dict[str, Model]:
-    """All registered models by name, each with its default choices."""
-    return {name: family.model() for name, family in FAMILIES.items()}
+    """All registered models by name, each with its default choices; those of other packages that load included."""
+    found = dict(FAMILIES)
+    for name in plugins.names():
+        with contextlib.suppress(ParameterError):  # `find` tells why
+            found[name] = plugins.load(name)
+    return {name: family.model() for name, family in found.items()}
 
 
-def make(name: str, **parameters: Any) -> BRDF:
+def make(name: str | Model, **parameters: Any) -> BRDF:
     """A BRDF of one model.
 
     Parameters
     ----------
-    name : str
-        A key of `models`.
+    name : str or Model
+        A key of `models`; or a model of your own.
     **parameters : float or str
         The parameters of the model; angles in radians. Also the choices of models that come in several forms, such as
         ``variant="full"`` of oren_nayar.
@@ -37,6 +44,8 @@ def make(name: str, **parameters: Any) -> BRDF:
     >>> make("lambertian", albedo=0.8) + make("ggx", k_s=1.0, alpha=0.3, f_0=0.04)
     lambertian(albedo=0.8) + ggx(k_s=1, alpha=0.3, f_0=0.04)
     """
+    if isinstance(name, Model):
+        return BRDF([Term(name, name.values(parameters))])
     family = find(name)
     chosen = {key: parameters.pop(key) for key, value in [*parameters.items()] if isinstance(value, str | bool)}
     model = family.model(**chosen)

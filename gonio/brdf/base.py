@@ -27,6 +27,7 @@ from gonio.errors import GeometryError, ParameterError
 from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
+_SLANTED = np.array([0.6, 0.0, 0.8])
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,10 @@ class Model:
     choices: Mapping[str, str] = field(default_factory=dict)
     own: bool = False
 
+    def __post_init__(self) -> None:
+        if self.function is not None and not hasattr(self.function, "py_func"):
+            raise ParameterError(f"{self.name}: its function is not compiled; decorate it with @gonio.jit.model")
+
     @property
     def expression(self) -> str:
         """Name and choices, as `gonio.brdf.parse` reads them: ``"oren_nayar[variant=full]"``."""
@@ -164,10 +169,12 @@ class Term:
     @property
     def plain(self) -> bool:
         """Compiled, isotropic, no user's, without kinks and features: what a rule for smooth integrands may take."""
-        model = self.model
-        slanted = np.array([0.6, 0.0, 0.8])
-        smooth = len(self.kinks(slanted)) == 0 and len(self.features(slanted)) == 0
-        return smooth and model.function is not None and model.isotropic and not model.own
+        return len(self.kinks(_SLANTED)) == 0 and self.mirror_only and not self.model.own
+
+    @property
+    def mirror_only(self) -> bool:
+        """Compiled, isotropic and without narrow structures elsewhere than at the mirror direction."""
+        return self.model.function is not None and self.model.isotropic and len(self.features(_SLANTED)) == 0
 
     def features(self, omega_r: Array) -> Array:
         """Narrow structures elsewhere than at the mirror: rows of a unit vector and a half width [rad], shape (k, 4)."""

@@ -1,7 +1,7 @@
 """The registered BRDF models: which names there are, and which choices each leaves.
 
 A family is a name with choices, such as oren_nayar's variant; with the choices made it is one `Model`. Packages of others
-add families by an entry point of the group ``gonio.brdf_models`` that loads a `Model` or a `Family`.
+add families by entry points, see `gonio.brdf.plugins`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from gonio.brdf.specular import SPECULAR
 from gonio.brdf.ward import WARD
 from gonio.errors import ParameterError
 
-ENTRY_POINTS = "gonio.brdf_models"
 _PART = re.compile(r"\s*(\w+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 
@@ -105,11 +104,14 @@ FAMILIES: dict[str, Family] = {
 
 def find(name: str) -> Family:
     """The registered family of that name, or a `ParameterError` with the nearest one."""
-    if name not in FAMILIES:
-        raise ParameterError(
-            f"there is no BRDF model {name!r}{_suggest(name, FAMILIES)}; known are: {', '.join(sorted(FAMILIES))}"
-        )
-    return FAMILIES[name]
+    if name in FAMILIES:
+        return FAMILIES[name]
+    from gonio.brdf import plugins
+
+    if name in plugins.names():
+        return plugins.load(name)
+    known = sorted({*FAMILIES, *plugins.names()})
+    raise ParameterError(f"there is no BRDF model {name!r}{_suggest(name, known)}; known are: {', '.join(known)}")
 
 
 def parse(expression: str) -> tuple[Model, ...]:
