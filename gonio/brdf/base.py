@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import ArrayLike, NDArray
 
 from gonio import jit
@@ -27,6 +28,7 @@ from gonio.errors import GeometryError, ParameterError
 from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
+_FEW = 16  # parameters of a term that a sum keeps in registers
 _SLANTED = np.array([0.6, 0.0, 0.8])
 
 
@@ -78,7 +80,7 @@ class Model:
         In the order of the parameter array, whose first numbers they are.
     function : callable
         ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function and for
-        a function that is not compiled.
+        a function that is not compiled. p is an array or, in sums, up to 16 numbers as a tuple: take them one by one.
     lobe_width : callable, optional
         Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
         angle; the integrator lays its nodes by it. None: no lobe.
@@ -283,11 +285,12 @@ class BRDF:
         """
         wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
         flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
-        out = np.zeros(len(flat_i))
-        fused = accumulate_sum(self.terms)
+        fused = sum_kernel(self.terms)
         if fused is not None:
-            fused[0](flat_i, flat_r, fused[1], 1.0, out)
+            out = np.empty(len(flat_i))
+            fused[0](flat_i, flat_r, fused[1], out)
             return out.reshape(wi.shape[:-1])
+        out = np.zeros(len(flat_i))
         for term in self.terms:
             accumulate(term.model)(flat_i, flat_r, term.values, term.weight, out)
         return out.reshape(wi.shape[:-1])
@@ -349,36 +352,66 @@ def _accumulate(function: Callable[..., float]) -> Any:
     return jit.kernel(accumulate_terms)
 
 
-def accumulate_sum(terms: Sequence[Term]) -> tuple[Any, Array] | None:
-    """Kernel as of `accumulate`, and parameter array, of several compiled terms in one pass; None if they are not."""
+def sum_kernel(terms: Sequence[Term]) -> tuple[Any, Array] | None:
+    """``kernel(omega_i (n, 3), omega_r (n, 3), p, out (n,))`` that fills `out` with a sum of compiled terms, and its p.
+
+    None for a single term or if one isn't compiled.
+    """
     functions = tuple(term.model.function for term in terms)
     if len(functions) < 2 or None in functions:
         return None
     packed = np.array([x for term in terms for x in (term.weight, *term.values)])
-    return _accumulate(_weighted_sum(functions, tuple(1 + len(term.values) for term in terms))), packed
+    return _sum_kernel(functions, tuple(len(term.values) for term in terms)), packed
 
 
 @functools.cache
-def _weighted_sum(functions: tuple[Any, ...], sizes: tuple[int, ...]) -> Any:
-    """Scalar function of a sum of terms; its parameter array holds, term after term, weight and parameters."""
-    total, start = None, 0
+def _sum_kernel(functions: tuple[Any, ...], sizes: tuple[int, ...]) -> Any:
+    """Kernel of a sum of terms; its parameter array holds, term after term, weight and parameters."""
+    load: Any = None
+    total: Any = None
+    start = 0
     for function, size in zip(functions, sizes, strict=True):
-        total, start = _joined(total, function, start), start + size
-    return total
+        load, total = _joined(load, total, function, start, size)
+        start += 1 + size
+
+    def fill_with_sum(omega_i, omega_r, p, out):  # type: ignore[no-untyped-def]
+        i, r = omega_i.ravel(), omega_r.ravel()
+        numbers = load(p)  # read once: in the loop nobody could know that `out` doesn't overlap them
+        for k in range(out.size):
+            out[k] = total(i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2], numbers)
+
+    return jit.kernel(fill_with_sum)
 
 
-def _joined(before: Any, function: Callable[..., float], start: int) -> Any:
+def _joined(load: Any, before: Any, function: Callable[..., float], start: int, size: int) -> tuple[Any, Any]:
+    """What takes the numbers of one more term from the array, and the sum that takes those."""
+    first, stop = start + 1, start + 1 + size
+    if 0 < size <= _FEW:
+
+        def own(p):  # type: ignore[no-untyped-def]
+            return p[start], to_fixed_tuple(p[first:stop], size)
+
+    else:
+
+        def own(p):  # type: ignore[no-untyped-def]
+            return p[start], p[first:stop]
+
+    numbers_of: Any = jit.model(own)
     if before is None:
 
-        def first(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-            return p[start] * function(xi, yi, zi, xr, yr, zr, p[start + 1 :])
+        def only(xi, yi, zi, xr, yr, zr, numbers):  # type: ignore[no-untyped-def]
+            return numbers[0] * function(xi, yi, zi, xr, yr, zr, numbers[1])
 
-        return jit.model(first)
+        return numbers_of, jit.model(only)
 
-    def both(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-        return before(xi, yi, zi, xr, yr, zr, p) + p[start] * function(xi, yi, zi, xr, yr, zr, p[start + 1 :])
+    def all_numbers(p):  # type: ignore[no-untyped-def]
+        return load(p), numbers_of(p)
 
-    return jit.model(both)
+    def both(xi, yi, zi, xr, yr, zr, numbers):  # type: ignore[no-untyped-def]
+        rest, mine = numbers
+        return before(xi, yi, zi, xr, yr, zr, rest) + mine[0] * function(xi, yi, zi, xr, yr, zr, mine[1])
+
+    return jit.model(all_numbers), jit.model(both)
 
 
 def _accumulate_array(
