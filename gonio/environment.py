@@ -107,7 +107,7 @@ def _image(file: Path) -> NDArray[np.generic]:
 def _exr(file: Path) -> NDArray[np.generic]:
     """R, G, B, or the luminance Y, or the only channel there is."""
     try:
-        import OpenEXR  # type: ignore[import-not-found,unused-ignore]
+        import OpenEXR
     except ImportError:
         raise DatasetError(
             f"{file}: reading OpenEXR needs the package OpenEXR (gonio's extra exr): pip install OpenEXR, or save the image "

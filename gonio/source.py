@@ -28,6 +28,7 @@ from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
 ViewAxis = (0.0, 0.0, 1.0)
+SMALLEST_DISK = 1e-8  # half angle [rad]
 
 
 @dataclass(frozen=True)
@@ -179,12 +180,15 @@ def disk(
     theta, phi : float
         Direction of the centre [rad].
     half_angle : float
-        [rad], 0 < half_angle <= pi/2.
+        [rad], 1e-8 <= half_angle <= pi/2.
     radiance, irradiance : float
         One of the two: L_i, or the irradiance on the plane normal to the axis, pi L_i sin^2(half_angle).
     """
-    if not (math.isfinite(half_angle) and 0 < half_angle <= math.pi / 2):
-        raise ParameterError(f"disk: half_angle = {math.degrees(half_angle):g} degrees; choose 0 < half_angle <= 90 degrees")
+    if not (math.isfinite(half_angle) and SMALLEST_DISK <= half_angle <= math.pi / 2):
+        raise ParameterError(
+            f"disk: half_angle = {math.degrees(half_angle):g} degrees; choose {math.degrees(SMALLEST_DISK):.1g} to 90 "
+            "degrees, or a collimated beam instead of a smaller disk"
+        )
     if (radiance is None) == (irradiance is None):
         raise ParameterError("disk: give either radiance or irradiance")
     if radiance is None:
@@ -335,6 +339,7 @@ def _axis(axis: Sequence[float]) -> tuple[float, float, float]:
     vector = np.asarray(axis, dtype=float)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)) or not np.any(vector):
         raise GeometryError(f"axis = {list(axis)} is no direction; give three finite numbers, not all zero")
+    vector = vector / np.max(np.abs(vector))  # so that the squares neither vanish nor overflow
     x, y, z = vector / np.linalg.norm(vector)
     return float(x), float(y), float(z)
 

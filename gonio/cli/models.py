@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gonio.cli.output import Output, json_option, speaking
+from gonio.config.scene import written_name
 from gonio.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def _list(output: Output, found: dict[str, Family]) -> None:
     for name, model in default.items():
         flags = f"{'R' if model.reciprocal else '-'} {'E' if model.energy_bounded else '-'}"
         choices = "; ".join(f"{key}={'|'.join(allowed)}" for key, allowed in found[name].choices.items())
-        numbers = ", ".join(p.name for p in model.parameters)
+        numbers = ", ".join(map(written_name, model.parameters))
         output.say(f"{name:<{width}}  {flags}  {numbers}{f'  [{choices}]' if choices else ''}")
     output.say("\nR: reciprocal; E: directional albedo at most 1. `gonio models NAME` explains one and draws its lobe.")
     output.result(models={name: _plain(model) for name, model in default.items()})
@@ -83,8 +84,8 @@ def _explain(output: Output, family: Family, model: Model) -> None:
     if about:
         output.say(about + "\n")
     for p in model.parameters:
-        output.say(f"{p.name:<12}{_range(p)}: {p.doc}")
-        output.say(f"{'':<12}prior of a fit: {_prior(p)}{_held(p)}")
+        output.say(f"{written_name(p):<12} {_range(p)}: {p.doc}")
+        output.say(f"{'':<12} prior of a fit: {_prior(p)}{_held(p)}")
     for key, allowed in family.choices.items():
         made = dict(model.choices).get(key, allowed[0])
         output.say(f"{key}: " + ", ".join(f"{a} (this one)" if a == made else a for a in allowed))

@@ -29,7 +29,7 @@ def test_the_list_has_one_line_for_each_model(capsys: pytest.CaptureFixture[str]
 def test_one_model_in_full(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["models", "oren_nayar[variant=full]", "--plot", str(tmp_path / "new" / "lobe.png")]) == 0
     told = capsys.readouterr().out
-    for words in ("sigma       0 to 90 deg", "uniform 0 to 51.57 deg", "full (this one)", "Source: Oren & Nayar"):
+    for words in ("sigma_deg    0 to 90 deg", "uniform 0 to 51.57 deg", "full (this one)", "Source: Oren & Nayar"):
         assert words in told, words
     assert "directional albedo can exceed 1" in told and "theta_i [deg]: a 10, b 45, c 75" in told
     assert max(map(len, told.splitlines())) < 160
