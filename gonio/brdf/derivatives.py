@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 NODES, LEVELS = 13, 10  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
 _STEEPER = 3.0  # growth towards the end of a range of a derivative that is infinite there; a root's is 10
-_ENOUGH = 1e-13  # relative change from one length to the next at which no shorter one is tried
+_ENOUGH, _GOOD = 1e-13, 1e-9  # relative change from one length to the next at which no shorter one is tried: at once, or
+# once rounding has taken over
 
 
 def jacobian(terms: tuple[Term, ...], omega_i: Array, omega_r: Array) -> Array:
@@ -112,11 +113,17 @@ def _filling(function: Callable[..., float]) -> Any:
 def seeds(model: Model, p: Array) -> Array:
     """Derivatives of the parameter array, derived numbers included, with respect to the k parameters: (k, p.size)."""
     k = len(model.parameters)
-    out = np.zeros((k, len(p)))
-    out[:, :k] = np.eye(k)
-    if model.derived is not None:
-        for j, parameter in enumerate(model.parameters):
-            out[j, k:] = differentiate(_along(model.derived, p[:k], j), float(p[j]), parameter)
+    if model.derived is None:
+        return np.eye(k, len(p))
+    return _seeds(model.derived, model.parameters, tuple(map(float, p[:k])))
+
+
+@functools.lru_cache(maxsize=256)
+def _seeds(derived: Callable[[Array], Array], parameters: tuple[Parameter, ...], values: tuple[float, ...]) -> Array:
+    p = np.array(values)
+    rows = [differentiate(_along(derived, p, j), values[j], parameter) for j, parameter in enumerate(parameters)]
+    out = np.concatenate((np.eye(len(p)), np.array(rows)), axis=1)
+    out.flags.writeable = False
     return out
 
 
@@ -157,17 +164,20 @@ def differentiate(function: Callable[[float], Array], x: float, parameter: Param
     best = last = error = np.zeros(0)
     for level in range(LEVELS):
         nodes, weights = _rule(x, max(parameter.lower, x - half), min(parameter.upper, x + half))
+        if level == 0:
+            first, end = function(float(nodes[0])), function(float(nodes[-1]))
+            if np.array_equal(first, end) and np.array_equal(first, function(x)):
+                return np.zeros(len(first))
         values = np.array([function(float(t)) for t in nodes])
-        if level == 0 and np.all(values == values[0]):
-            return np.zeros(values.shape[1])
         now = weights @ (values - values[nodes == x])
         if level == 0:
             best, error = now, np.full(len(now), np.inf)
         else:
             change = np.abs(now - last)
-            best = np.where(change < error, now, best)
-            error = np.minimum(error, change)
-            if np.all(error <= _ENOUGH * np.max(np.abs(best), initial=0.0)):
+            better = change < error
+            best, error = np.where(better, now, best), np.minimum(error, change)
+            worst = np.max(error) / (np.max(np.abs(best)) or 1.0)
+            if worst <= _ENOUGH or (worst <= _GOOD and not np.any(better)):
                 break
         last, half = now, 0.25 * half
     return best

@@ -66,6 +66,7 @@ _TWO = {
     "min": "{t} if {a} <= {b} else {s}",
 }
 _STEPS = {"int", "len", "bool", "floor", "ceil", "trunc", "round", "isnan", "isfinite", "isinf", "range"}  # derivative 0
+_ELEMENTARY = {"exp", "log", "log_near", "log1p", "power"}
 _QUICK = {"sqrt", "abs", "fabs", "min", "max", "float"}
 _OPERATORS: dict[type, str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
 
@@ -207,8 +208,9 @@ class _Writer:
             found = self.resolve(node.func)
         except (KeyError, AttributeError):
             raise self.refuse(node) from None
-        known = getattr(found, "__module__", "") in ("math", "builtins", elementary.__name__) or isinstance(found, np.ufunc)
-        return (str(found.__name__) if known else ""), found
+        module, name = getattr(found, "__module__", ""), str(getattr(found, "__name__", ""))
+        known = name in _ELEMENTARY if module == elementary.__name__ else module in ("math", "builtins")
+        return (name if known or isinstance(found, np.ufunc) else ""), found
 
     def resolve(self, node: ast.AST) -> Any:
         if isinstance(node, ast.Attribute):
