@@ -22,7 +22,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -276,27 +276,49 @@ class Harmonics(Field):
         return 1.0 / (self.degree + 1.0)
 
     def at(self, directions: Array) -> Array:
-        x, y, z = directions.T
         c, total = self.coefficients, np.zeros(len(directions))
-        # sin^m(theta) cos(m phi) and sin^m(theta) sin(m phi) are the real and imaginary part of (x + iy)^m
-        rim, turn = np.ones(len(directions), dtype=complex), x + 1j * y
-        sectoral = math.sqrt(1.0 / (4.0 * math.pi))
-        for m in range(self.degree + 1):
+        for l, m, cosine, sine in _harmonics(directions, self.degree):
+            total += c[l * l + l + m] * cosine
             if m:
-                rim = rim * turn
-                sectoral *= math.sqrt((2.0 * m + 1.0) / (2.0 * m))
-            before, now = np.zeros(len(directions)), np.full(len(directions), sectoral)
-            for l in range(m, self.degree + 1):
-                if l > m:
-                    a = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
-                    b = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0))
-                    before, now = now, a * (z * now - b * before)
-                if m == 0:
-                    total += c[l * l + l] * now
-                else:
-                    wave = c[l * l + l + m] * rim.real + c[l * l + l - m] * rim.imag
-                    total += math.sqrt(2.0) * now * wave
+                total += c[l * l + l - m] * sine
         return total
+
+    def turned(self, rotation: Array) -> Harmonics:
+        """The same light in coordinates w' = rotation w, which is again harmonics of this degree.
+
+        Coefficients are integrals of products of two harmonics over the sphere, which a Gauss rule in the height with
+        equidistant azimuths gives exactly.
+        """
+        n = self.degree + 1
+        height, weight = np.polynomial.legendre.leggauss(n)
+        phi = 2.0 * np.pi * np.arange(2 * n) / (2 * n)
+        w = unit_vector(np.arccos(height)[:, None], phi[None, :]).reshape(-1, 3)
+        light = self.at(w @ rotation) * np.repeat(weight * (np.pi / n), 2 * n)
+        coefficients = np.zeros(n * n)
+        for l, m, cosine, sine in _harmonics(w, self.degree):
+            coefficients[l * l + l + m] = light @ cosine
+            if m:
+                coefficients[l * l + l - m] = light @ sine
+        return Harmonics(coefficients)
+
+
+def _harmonics(directions: Array, degree: int) -> Iterator[tuple[int, int, Array, Array]]:
+    """Degree l, order m >= 0, and the values of Y_lm and Y_l-m at unit vectors (n, 3)."""
+    x, y, z = directions.T
+    # sin^m(theta) cos(m phi) and sin^m(theta) sin(m phi) are the real and imaginary part of (x + iy)^m
+    rim, turn = np.ones(len(directions), dtype=complex), x + 1j * y
+    sectoral = math.sqrt(1.0 / (4.0 * math.pi))
+    for m in range(degree + 1):
+        if m:
+            rim = rim * turn
+            sectoral *= math.sqrt((2.0 * m + 1.0) / (2.0 * m))
+        before, now = np.zeros(len(directions)), np.full(len(directions), sectoral)
+        for l in range(m, degree + 1):
+            if l > m:
+                a = math.sqrt((4.0 * l * l - 1.0) / (l * l - m * m))
+                b = math.sqrt(((l - 1.0) ** 2 - m * m) / (4.0 * (l - 1.0) ** 2 - 1.0))
+                before, now = now, a * (z * now - b * before)
+            yield (l, m, now, now) if m == 0 else (l, m, math.sqrt(2.0) * now * rim.real, math.sqrt(2.0) * now * rim.imag)
 
 
 @dataclass(frozen=True, eq=False)

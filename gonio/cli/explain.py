@@ -22,12 +22,12 @@ def explained(output: Output, made: ReflectanceMap, values: MapValues, rtol: flo
     """Print the table of steps, why each method was taken, and the sum."""
     from gonio import jit
     from gonio.brdf import term_names
-    from gonio.fields import Field, Lobes
+    from gonio.fields import Field, Harmonics, Lobes
 
     assert made.brdf is not None and made.source is not None
     parts = made.source.parts
     if made.viewer is not None:  # other fields are done last
-        parts = tuple(sorted(parts, key=lambda part: isinstance(part, Field) and not isinstance(part, Lobes)))
+        parts = tuple(sorted(parts, key=lambda part: isinstance(part, Field) and not isinstance(part, Lobes | Harmonics)))
     normal, seen = _normals(made)
     lights = _numbered([_kind(part) for part in parts])
     terms = term_names(term.model for term in made.brdf.terms)

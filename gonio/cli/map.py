@@ -39,7 +39,7 @@ def map_(
 
     from gonio import jit
     from gonio.config import load_scene
-    from gonio.fields import EnvironmentMap, Harmonics
+    from gonio.fields import EnvironmentMap
 
     with speaking(as_json) as output:
         step = _spacing(spacing, render)
@@ -54,10 +54,9 @@ def map_(
                 _make_folder(target)
         brdf, posterior, origin = steps.scene_brdf(config, scene.parent)
         source = steps.scene_source(config)
-        slow = sorted({part.kind for part in source.parts if isinstance(part, EnvironmentMap | Harmonics)})
-        if config.viewer is not None and slow:
+        if config.viewer is not None and any(isinstance(part, EnvironmentMap) for part in source.parts):
             output.warn(
-                f"{scene}: with the viewer off axis, {' and '.join(slow)} cost up to a second for each of the "
+                f"{scene}: with the viewer off axis, an environment map costs up to a second for each of the "
                 f"{config.n[0] * config.n[1]} gradients; a smaller [grid] n or a larger rtol shortens it"
             )
         made, values = steps.compute_map(

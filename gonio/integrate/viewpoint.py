@@ -1,8 +1,8 @@
 """Viewers off the axis and surfaces with a grain.
 
-A viewer elsewhere sees the same scene turned: beams and caps are turned with him, so that all fast methods hold; fields stay
-where they are and are integrated element by element. A surface with a grain, an anisotropic BRDF, needs to be told which
-way it runs.
+A viewer elsewhere sees the same scene turned: beams, caps, lobes and harmonics are turned with him, so that all fast methods
+hold; environment maps and a user's functions stay where they are and are integrated element by element. A surface with a
+grain, an anisotropic BRDF, needs to be told which way it runs.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from gonio import jit
 from gonio.brdf.base import BRDF
 from gonio.errors import GeometryError, IntegrationError, ParameterError
-from gonio.fields import Field, FunctionField, Lobes
+from gonio.fields import Field, FunctionField, Harmonics, Lobes
 from gonio.geometry import angles, unit_vector
 from gonio.integrate import closed_forms
 from gonio.integrate.adaptive import over_field
@@ -83,7 +83,7 @@ def seen_from(
     fast: list[Part] = []
     slow: list[Field] = []
     for part in Source.of(source).parts:
-        if isinstance(part, Field) and not isinstance(part, Lobes):
+        if isinstance(part, Field) and not isinstance(part, Lobes | Harmonics):
             slow.append(part)
         else:
             fast.append(_turned_part(part, rotation))
@@ -150,6 +150,8 @@ def _turned_part(part: Part, rotation: Array) -> Part:
     if isinstance(part, Cap):
         same = part.half_angle >= math.pi and part.profile is None
         return part if same else replace(part, axis=turned(part.axis))
+    if isinstance(part, Harmonics):
+        return part.turned(rotation)
     assert isinstance(part, Lobes)
     theta, phi = angles(part.axes() @ rotation.T)
     return replace(part, theta=theta, phi=phi)

@@ -10,6 +10,7 @@ import pytest
 
 import gonio
 from gonio.errors import DatasetError, GeometryError, ParameterError
+from gonio.fields import Harmonics
 from gonio.geometry import unit_vector
 
 make = gonio.source.make
@@ -150,3 +151,25 @@ def test_a_function_that_turns_negative_later_is_told() -> None:
     paper = gonio.brdf.make("lambertian", albedo=0.5)
     with pytest.raises(ParameterError, match="must be finite"):
         gonio.reflectance_map(paper, lambda w: np.where(w[:, 0] * w[:, 1] > 0.4, -1.0, 1.0), 0.1, 0.2, rtol=1e-2)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 5, 30])
+def test_turned_harmonics_are_the_same_light(degree: int) -> None:
+    rng = np.random.default_rng(degree)
+    light = Harmonics(rng.normal(size=(degree + 1) ** 2))
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    w = rng.normal(size=(300, 3))
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    np.testing.assert_allclose(light.turned(turn).at(w @ turn.T), light.at(w), atol=1e-12 * np.abs(light.at(w)).max())
+
+
+def test_harmonics_from_the_side_as_any_function() -> None:
+    """The fast path of turned harmonics, and the slow one that knows nothing of them."""
+    light = gonio.source.make("spherical_harmonics", coefficients=[3.5, 0.2, 0.5, -0.3, 0.1, 0.0, 0.2, 0.1, -0.1])
+    paint = gonio.brdf.make("lambertian", albedo=0.5) + gonio.brdf.make("ggx", k_s=1.0, alpha=0.4, f_0=0.04)
+    p, q, viewer = np.array([0.1, -0.5, 0.3]), np.array([0.2, 0.4, -0.8]), (0.6, 2.0)
+    fast = gonio.reflectance_map(paint, light, p, q, rtol=1e-7, viewer=viewer)
+    slow = gonio.reflectance_map(paint, gonio.source.function(light.radiance), p, q, rtol=1e-5, viewer=viewer)
+    np.testing.assert_allclose(fast.value, slow.value, rtol=2e-5)
+    assert all("viewer off axis" not in step.reason for step in fast.plan)
