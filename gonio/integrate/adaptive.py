@@ -228,13 +228,21 @@ class _Block:
         self._approach_features()
 
     def _approach_features(self) -> None:
-        """Halve cells near the mirror direction and the light's peaks until they are as small as these."""
+        """Halve cells near the mirror direction, the model's features and the light's peaks until they are as small."""
         feature, widths = [], []
         if self.width is not None:
             mirror = self.fixed * np.array([-1.0, -1.0, 1.0])
             feature.append(mirror[:, None, :])
             # across the plane of incidence the lobe is narrower by cos theta_r
             widths.append(self.width * np.maximum(self.fixed[:, 2:3], 0.02))
+        own = [self.term.features(direction) for direction in self.fixed]
+        most = max((len(rows) for rows in own), default=0)
+        if most:
+            padded: Array = np.full((len(own), most, 4), (0.0, 0.0, 1.0, math.inf))
+            for k, rows in enumerate(own):
+                padded[k, : len(rows)] = rows
+            feature.append(padded[..., :3])
+            widths.append(padded[..., 3])
         if self.light is not None and self.light.peaks is not None and self.light.widths is not None:
             feature.append(self.light.peaks)
             widths.append(np.broadcast_to(self.light.widths, self.light.peaks.shape[:2]))
@@ -260,7 +268,7 @@ class _Block:
             self.base, self.box = _halve(self.base, self.box, ways)
             if len(self.base) * NODES.size**2 > _LARGEST * len(self.fixed):
                 raise IntegrationError(
-                    f"{self.term.model.name}: more than {_LARGEST} nodes around its lobe for one gradient"
+                    f"{self.term.model.name}: more than {_LARGEST} nodes around its lobes for one gradient"
                 )
 
     def run(self, rtol: float, atol: float) -> tuple[Array, Array]:

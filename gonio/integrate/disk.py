@@ -63,9 +63,7 @@ def _nodes(half_angle: float) -> tuple[Array, NDArray[np.int64]]:
 
 def suits(term: Term, cap: Cap) -> bool:
     """Whether `add` can do most gradients."""
-    model, slanted = term.model, np.array([0.6, 0.0, 0.8])
-    smooth = model.function is not None and model.isotropic and not model.own and len(term.features(slanted)) == 0
-    return cap.half_angle <= LARGEST and cap.profile is None and smooth
+    return cap.half_angle <= LARGEST and cap.profile is None and term.mirror_only and not term.model.own
 
 
 def add(

@@ -83,7 +83,8 @@ def integrate_cap(
     Parameters
     ----------
     term : Term
-        With values (no delta). Anisotropic ones and functions of the user's go to `gonio.integrate.adaptive`.
+        With values (no delta). Anisotropic ones, those with features and functions of the user's go to
+        `gonio.integrate.adaptive`.
     cap : Cap
     elements : Elements, length n
     rtol, atol : float
@@ -108,8 +109,7 @@ def integrate_cap(
     IntegrationError
         If an element would need more than 16 million nodes.
     """
-    model = term.model
-    if model.function is None or model.own or not model.isotropic:
+    if term.model.own or not term.mirror_only:
         local = cap.half_angle > _NARROW if about_normal is None else about_normal
         return over_cap(term, cap, elements, rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort)
     scene = _scene(term, cap, elements, about_normal)
