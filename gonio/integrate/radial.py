@@ -32,7 +32,7 @@ _NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no 
 _DEEPEST = 40  # halvings
 _FIRST, _GROWTH = 1.9, 4.4  # widths of a feature: the interval next to it, and how the others grow
 _RATE = 2.8  # the series of intervals graded so fall at least like this
-_PROBES = np.array([-0.98, -0.45, 0.2, 0.93])
+_PROBES = np.array([-1.0, -0.45, 0.2, 1.0])
 _LOOKUP = 256
 _END = 1.0 - 2.0**-53
 
