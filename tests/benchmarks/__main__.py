@@ -47,7 +47,7 @@ def main() -> None:
     """Run the sections and print, or write the page."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="all by default")
-    parser.add_argument("--quick", action="store_true", help="fewer scenes and repetitions, a minute on an idle machine; no page")
+    parser.add_argument("--quick", action="store_true", help="a few scenes, a minute on an idle machine; writes no page")
     parser.add_argument("--scene", default="", help="accuracy: only scenes whose name contains this")
     given = parser.parse_args()
     chosen = given.section or SECTIONS

@@ -330,3 +330,13 @@ def test_the_command_ends_in_one_sentence(text: str, tmp_path: Path, capsys: pyt
     assert main(["map", str(tmp_path / "scene.toml"), "--out", str(tmp_path / "map.nc")]) == 2
     told = capsys.readouterr()
     assert told.err.startswith("error: ") and "defect" not in told.err and not (tmp_path / "map.nc").exists()
+
+
+def test_what_is_commented_in_the_file_of_gonio_init_is_right_too(tmp_path: Path) -> None:
+    text = config.default_documents()["scene.toml"]
+    text = text.replace('# run = "runs/first"', "").replace('# use = "fit"', "")
+    lines = [line[2:] if re.match(r"# (\[|\w+ = )", line) else line for line in text.splitlines()]
+    got = scene("\n".join(lines), tmp_path)
+    assert [one.kind for one in got.sources] == ["collimated", "hemispherical", "disk", "environment_map"]
+    assert got.viewer is not None and got.map == tmp_path / "map.nc" and got.plot == tmp_path / "map.png"
+    assert got.brdf.build().name == "lambertian+ggx"
