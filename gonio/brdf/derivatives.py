@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from gonio.brdf.base import Model, Parameter, Term
 
 Array = NDArray[np.float64]
-NODES, LEVELS = 13, 10  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
+NODES, LEVELS = 13, 9  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
+_FIRST = 0.1  # half of the first interval, as a share of how far the parameter has to move to matter
+_ENOUGH, _GOOD = 1e-12, 1e-9  # relative error at which no shorter interval is tried: at once; once rounding has taken over
 _STEEPER = 3.0  # growth towards the end of a range of a derivative that is infinite there; a root's is 10
-_ENOUGH, _GOOD = 1e-13, 1e-9  # relative change from one length to the next at which no shorter one is tried: at once, or
-# once rounding has taken over
 
 
 def jacobian(terms: tuple[Term, ...], omega_i: Array, omega_r: Array) -> Array:
@@ -157,43 +157,45 @@ def _differences(term: Term, omega_i: Array, omega_r: Array) -> Array:
 def differentiate(function: Callable[[float], Array], x: float, parameter: Parameter) -> Array:
     """Derivative (m,) of a function of one parameter at x, from values inside the parameter's range only.
 
-    Polynomials through Chebyshev nodes on shorter and shorter intervals around x, one-sided where the range ends; of
-    each number the derivative counts that changed least from one interval to the next.
+    Polynomials through Chebyshev nodes on shorter and shorter intervals around x, one-sided where the range ends; of each
+    number the derivative counts that changes least if the farthest node is left out.
     """
-    half = 0.25 * _scale(parameter, x)
-    best = last = error = np.zeros(0)
+    half = _FIRST * _scale(parameter, x)
+    best = error = np.zeros(0)
+    worst = np.inf
     for level in range(LEVELS):
         nodes, weights = _rule(x, max(parameter.lower, x - half), min(parameter.upper, x + half))
         if level == 0:
-            first, end = function(float(nodes[0])), function(float(nodes[-1]))
-            if np.array_equal(first, end) and np.array_equal(first, function(x)):
-                return np.zeros(len(first))
-        values = np.array([function(float(t)) for t in nodes])
-        now = weights @ (values - values[nodes == x])
+            middle, *ends = (function(float(t)) for t in (x, nodes[0], nodes[-1]))
+            if all(np.array_equal(middle, end) for end in ends):
+                return np.zeros(len(middle))
+        differences = np.array([function(float(t)) - middle if t != x else np.zeros(len(middle)) for t in nodes])
+        now, check = weights @ differences
+        change = np.abs(now - check)
         if level == 0:
-            best, error = now, np.full(len(now), np.inf)
+            best, error = now, change
         else:
-            change = np.abs(now - last)
             better = change < error
-            best, error = np.where(better, now, best), np.minimum(error, change)
-            worst = np.max(error) / (np.max(np.abs(best)) or 1.0)
-            if worst <= _ENOUGH or (worst <= _GOOD and not np.any(better)):
-                break
-        last, half = now, 0.25 * half
+            best, error = np.where(better, now, best), np.where(better, change, error)
+        before, worst = worst, float(np.max(error) / (np.max(np.abs(best)) or 1.0))
+        if worst <= _ENOUGH or _GOOD >= worst > 0.5 * before:
+            break
+        half *= 0.25
     return best
 
 
 def _rule(x: float, lower: float, upper: float) -> tuple[Array, Array]:
-    """Nodes with x among them, and the weights of their values in the polynomial's derivative at x."""
+    """Nodes with x among them, and the weights of f - f(x) in the polynomial's derivative at x: by all nodes, and by all but
+    the farthest; shapes (n,) and (2, n)."""
     nodes = 0.5 * (lower + upper) - 0.5 * (upper - lower) * np.cos(np.pi * np.arange(NODES) / (NODES - 1))
     nodes = np.clip(nodes, lower, upper)
-    at = int(np.argmin(np.abs(nodes - x)))
+    at, farthest = int(np.argmin(np.abs(nodes - x))), int(np.argmax(np.abs(nodes - x)))
     nodes[at] = x
     apart = (nodes[:, None] - nodes[None, :]) / (upper - lower) * 4.0
     np.fill_diagonal(apart, 1.0)
-    w = 1.0 / np.prod(apart, axis=1)  # barycentric weights
+    barycentric = 1.0 / np.prod(apart, axis=1)
+    fewer = barycentric * apart[:, farthest]
+    fewer[farthest] = 0.0
     to = x - nodes
-    to[at] = 1.0
-    weights = w / w[at] / to
-    weights[at] = 0.0  # values are taken relative to the one at x
-    return nodes, weights
+    to[at] = np.inf  # values are taken relative to the one at x
+    return nodes, np.stack([w / w[at] / to for w in (barycentric, fewer)])

@@ -30,6 +30,7 @@ from gonio.brdf.tangent import tangent
 from gonio.errors import ParameterError
 from gonio.geometry import unit_vector
 from tests.brdf_truth import Geometry
+from tests.gates import record
 
 Array = NDArray[np.float64]
 make = gonio.brdf.make
@@ -46,15 +47,15 @@ def directions() -> tuple[Array, Array]:
     return unit_vector(theta[:, 0], phi[:, 0]), unit_vector(theta[:, 1], phi[:, 1])
 
 
-def agree(got: Array, truth: Array) -> float:
+def agree(got: Array, truth: Array, floor: float = 0.0) -> float:
     """Largest difference of two (n, k), relative to the largest of a column; an infinity must be one in both."""
     assert not np.any(np.isnan(got))
-    steep = np.abs(truth) > 1e8 * max(1.0, float(np.median(np.abs(truth))))  # a one-sided difference of an infinite slope
+    steep = np.abs(truth) > 1e12  # a one-sided difference of an infinite slope
     infinite = np.isinf(got)
     assert np.all(steep[infinite]) and np.all(np.sign(got[infinite]) == np.sign(truth[infinite]))
     apart = np.where(infinite, 0.0, np.abs(np.where(infinite, 0.0, got) - truth))
-    scale = np.max(np.where(infinite, 0.0, np.abs(truth)), axis=0)
-    return float(np.max(apart / np.where(scale > 1e-25, scale, 1.0)))  # mpmath's difference of a constant is 1e-45
+    scale = np.maximum(np.max(np.where(infinite, 0.0, np.abs(truth)), axis=0), floor)
+    return float(np.max(apart / np.where(scale > 1e-18, scale, 1.0)))  # mpmath's one-sided difference of a flat end is 1e-25
 
 
 # --- the primary formulas -------------------------------------------------------------------------------------------------
@@ -134,6 +135,7 @@ class _Mathematics(types.ModuleType):
 _ELEMENTARY = {
     "exp": mpmath.exp, "log": lambda x: mpmath.log(x) if x > 0 else -mpmath.inf, "log1p": mpmath.log1p,
     "log_near": lambda u, f: mpmath.log(u) if u > 0 else -mpmath.inf, "power": lambda x, y: mpf(x) ** y,
+    "two_products": lambda a, b, c, d: a * b + c * d,
 }  # fmt: skip
 
 
@@ -141,7 +143,7 @@ def in_mpmath(function: Any) -> Callable[..., Any]:
     """A model function, and all that it calls, executed by mpmath."""
     inner = getattr(function, "py_func", function)
     if inner.__module__ == "gonio.brdf.elementary":
-        return _ELEMENTARY[inner.__name__]
+        return _ELEMENTARY[inner.__name__]  # of bits, which mpmath's numbers do not have
 
     def swap(value: Any) -> Any:
         if value is math or value is np:
@@ -176,27 +178,46 @@ def middle(parameter: Parameter) -> float:
     return min(max(value, parameter.lower), parameter.upper)
 
 
-def parameter_sets(model: Model) -> Iterator[list[float]]:
-    """One inside the ranges; then each parameter at each of its ends."""
+def parameter_sets(model: Model) -> Iterator[tuple[list[float], list[int]]]:
+    """All inside the ranges, and all derivatives; then each parameter at each of its ends, and the derivative by it."""
     inside = [middle(p) for p in model.parameters]
-    yield inside
+    yield inside, [*range(len(inside))]
     for j, p in enumerate(model.parameters):
         for end in (p.lower, p.upper):
-            yield [*inside[:j], end, *inside[j + 1 :]]
+            yield [*inside[:j], end, *inside[j + 1 :]], [j]
 
 
-@pytest.mark.parametrize("expression", MODELS)
+SLOW = ("microfacet[distribution=gtr]", "microfacet[multiple_scattering=true]")  # tables of seconds, in derived numbers
+
+
+@pytest.mark.parametrize("expression", [name for name in MODELS if name not in SLOW])
 def test_every_model_against_itself_in_mpmath(expression: str) -> None:
-    model = MODELS[expression]
+    assert against_itself(expression) <= LIMIT
+
+
+@pytest.mark.gate
+def test_gate_every_model_against_itself_in_mpmath() -> None:
+    worst = {expression: against_itself(expression) for expression in MODELS}
+    assert max(worst.values()) <= LIMIT
+    name = max(worst, key=lambda n: worst[n])
+    record(
+        "derivatives of every model, inside and at the ends of all ranges", f"{worst[name]:.1e} ({name}) of the largest one",
+        f"<= {LIMIT:g}", "-", "pytest -m gate -k derivatives",
+    )  # fmt: skip
+
+
+def against_itself(expression: str) -> float:
+    """Largest error of the derivatives over parameter sets and directions, relative to the largest derivative."""
+    model, worst = MODELS[expression], 0.0
     twin = in_mpmath(model.function)
     omega_i, omega_r = directions()
     assert derivatives.how(model) == "automatic"
-    for values in parameter_sets(model):
+    for values, chosen in parameter_sets(model):
         brdf = BRDF([Term(model, model.complete(np.array(values)))])
         p, along = brdf.terms[0].values, derivatives.seeds(model, brdf.terms[0].values)
         truth = np.zeros((len(omega_i), len(values)))
-        with mpmath.workdps(30):
-            for k, j in itertools.product(range(len(omega_i)), range(len(values))):
+        with mpmath.workdps(50):
+            for k, j in itertools.product(range(len(omega_i)), chosen):
                 w = [mpf(c) for c in (*omega_i[k], *omega_r[k])]
                 side = _side(model.parameters[j], values[j])
                 start, slope = [mpf(x) for x in p], [mpf(x) for x in along[j]]
@@ -205,9 +226,12 @@ def test_every_model_against_itself_in_mpmath(expression: str) -> None:
                     return twin(*w, [a + t * b if b else a for a, b in zip(start, slope, strict=True)])
 
                 truth[k, j] = mpmath.diff(moved, 0, direction=side)
-        error = agree(brdf.jacobian(omega_i, omega_r), truth)
+        # a parameter so large that it hardly matters, such as gamma at 1e6: an error in what a change by 10 % does
+        floor = 0.1 * float(np.max(brdf.evaluate(omega_i, omega_r))) / max(1.0, *map(abs, values)) if len(chosen) == 1 else 0.0
+        error = agree(brdf.jacobian(omega_i, omega_r)[:, chosen], truth[:, chosen], floor)
         print(f"{expression} at {values}: {error:.1e}")
-        assert error <= LIMIT, values
+        worst = max(worst, error)
+    return worst
 
 
 # --- the language ---------------------------------------------------------------------------------------------------------
@@ -337,7 +361,7 @@ def test_sums_weights_shapes_and_deltas() -> None:
 def test_compiled_derivatives_are_kept_on_disk(tmp_path: Path) -> None:
     script = (
         "import numpy as np; from gonio import brdf, jit; up = np.array([0, 0, 1.0]); "
-        "print(brdf.make('ggx', k_s=1, alpha=0.3, f_0=0.04).jacobian(up, up), jit.compiled_count())"
+        "print(brdf.make('lommel_seeliger', w=1).jacobian(up, up), jit.compiled_count())"
     )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(jit.__file__).parents[1])}
     told = [
