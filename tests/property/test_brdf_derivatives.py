@@ -226,8 +226,9 @@ def against_itself(expression: str) -> float:
                     return twin(*w, [a + t * b if b else a for a, b in zip(start, slope, strict=True)])
 
                 truth[k, j] = mpmath.diff(moved, 0, direction=side)
-        # a parameter so large that it hardly matters, such as gamma at 1e6: an error in what a change by 10 % does
-        floor = 0.1 * float(np.max(brdf.evaluate(omega_i, omega_r))) / max(1.0, *map(abs, values)) if len(chosen) == 1 else 0.0
+        # a parameter so large that it hardly matters, such as gamma at 1e6, has a derivative of what rounding leaves of f
+        largest = float(np.max(brdf.evaluate(omega_i, omega_r)))
+        floor = 0.1 * largest / max(1.0, *map(abs, values)) if len(chosen) == 1 else 0.0
         error = agree(brdf.jacobian(omega_i, omega_r)[:, chosen], truth[:, chosen], floor)
         print(f"{expression} at {values}: {error:.1e}")
         worst = max(worst, error)
