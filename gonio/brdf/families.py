@@ -17,7 +17,8 @@ from gonio.brdf.hapke import hapke
 from gonio.brdf.kubelka_munk import KUBELKA_MUNK
 from gonio.brdf.lambertian import LAMBERTIAN
 from gonio.brdf.lommel_seeliger import LOMMEL_SEELIGER
-from gonio.brdf.microfacet import GGX
+from gonio.brdf.microfacet import BECKMANN, CHOICES, GGX
+from gonio.brdf.microfacet import build as microfacet
 from gonio.brdf.minnaert import MINNAERT
 from gonio.brdf.oren_nayar import OREN_NAYAR, OREN_NAYAR_FULL
 from gonio.brdf.phong import LAFORTUNE, PHONG
@@ -96,7 +97,9 @@ FAMILIES: dict[str, Family] = {
         single(ABG),
         single(HARVEY_SHACK),
         single(K_CORRELATION),
+        Family("microfacet", microfacet, CHOICES),
         single(GGX),
+        single(BECKMANN),
         single(SPECULAR),
     )
 }

@@ -2,69 +2,174 @@ r"""Microfacet models: rough mirrors made of small facets.
 
 .. math:: f_r = k_s \frac{F(\omega_r\cdot h)\,D(h)\,G}{4\cos\theta_i\cos\theta_r}
 
-Written without the half vector's normalisation: with :math:`|\omega_i+\omega_r|^2 = 2+2\cos g`,
-:math:`\cos^2\theta_h = (\mu_i+\mu_r)^2/(2+2\cos g)` and :math:`\sin^2\theta_h` from the tangential components, so nothing
-cancels near h = n.
+put together from a distribution D (`gonio.brdf.facets`), a reflectance F (`gonio.brdf.fresnel`) and a shadowing G:
+
+- smith: :math:`1/G = 1 + \Lambda_i + \Lambda_r`, height-correlated [1]_;
+- smith_separable: :math:`1/G = (1+\Lambda_i)(1+\Lambda_r)`;
+- v_groove: :math:`G = \min(1, 2\mu_h\mu_i/c, 2\mu_h\mu_r/c)` with :math:`c = \omega_r\cdot h` [2]_; it has kinks.
+
+All are written without the half vector's normalisation: with :math:`l^2 = |\omega_i+\omega_r|^2 = 2+2\cos g`,
+:math:`\cos^2\theta_h = (\mu_i+\mu_r)^2/l^2` and :math:`\sin^2\theta_h` from the tangential components, so nothing cancels
+near h = n. With :math:`M = \mu\Lambda`, :math:`G/(4\mu_i\mu_r) = 1/(4(\mu_i\mu_r+\mu_r M_i+\mu_i M_r))` is finite at
+the horizon. Facets reflect light once; ``multiple_scattering`` adds what the others give back
+(`gonio.brdf.multiple_scattering`).
 
 References
 ----------
-.. [1] B. Walter, S. R. Marschner, H. Li, K. E. Torrance, "Microfacet Models for Refraction through Rough Surfaces", EGSR
-   2007, eqs. 33, 34 (GGX: D and its Smith Lambda).
-.. [2] E. Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014, eqs. 72, 99
-   (GGX Lambda, height-correlated G).
-.. [3] T. S. Trowbridge, K. P. Reitz, "Average irregularity representation of a rough surface for ray reflection", JOSA
-   65(5), 1975.
-.. [4] C. Schlick, "An Inexpensive BRDF Model for Physically-based Rendering", CGF 13(3), 1994.
+.. [1] E. Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014, eq. 99.
+.. [2] K. E. Torrance, E. M. Sparrow, "Theory for Off-Specular Reflection From Roughened Surfaces", JOSA 57(9), 1967. R. L.
+   Cook, K. E. Torrance, "A Reflectance Model for Computer Graphics", ACM TOG 1(1), 1982 (which prints 1/pi where 1/4
+   belongs with a normalised D).
 """
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
+from gonio.brdf import multiple_scattering as again
 from gonio.brdf.base import Model, Parameter
+from gonio.brdf.facets import FACETS
+from gonio.brdf.fresnel import FRESNEL
+from gonio.errors import ParameterError
 
-INV_PI = 1.0 / math.pi
+Array = NDArray[np.float64]
+CHOICES = {
+    "distribution": tuple(FACETS),
+    "fresnel": tuple(FRESNEL),
+    "shadowing": ("smith", "smith_separable", "v_groove"),
+    "multiple_scattering": ("false", "true"),
+}
+LOWEST = 1e-30  # cosine at and below which a direction counts as at the horizon: squares must not underflow
 
 
 @jit.model
-def ggx_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
-    k_s, alpha, f_0 = p[0], p[1], p[2]
-    lit = (zi > 0.0) & (zr > 0.0)  # no branch: the loop vectorises
-    mu_i = zi if lit else 1.0
-    mu_r = zr if lit else 1.0
-    a2 = alpha * alpha
-    x, y, z = xi + xr, yi + yr, mu_i + mu_r
-    s2 = x * x + y * y  # |wi + wr|^2 sin^2 theta_h
-    l2 = s2 + z * z  # |wi + wr|^2 = 2 + 2 cos g
-    t = a2 * z * z + s2
-    d = a2 * INV_PI * l2 * l2 / (t * t)  # D(h) = a^2 / (pi (a^2 cos^2 theta_h + sin^2 theta_h)^2)
-    # G / (4 mu_i mu_r), height-correlated Smith
-    si2, sr2 = xi * xi + yi * yi, xr * xr + yr * yr
-    g = 0.5 / (mu_r * math.sqrt(mu_i * mu_i + a2 * si2) + mu_i * math.sqrt(mu_r * mu_r + a2 * sr2))
-    c = 1.0 - 0.5 * math.sqrt(l2)  # 1 - h.v, as h.v = |wi + wr| / 2
-    c = c if c > 0.0 else 0.0
-    c2 = c * c
-    f = f_0 + (1.0 - f_0) * c2 * c2 * c
-    return k_s * f * d * g if lit else 0.0
+def smith(mu_i, mu_r, m_i, m_r, z, l2):  # type: ignore[no-untyped-def]
+    """Numerator and denominator of G / (4 mu_i mu_r), height-correlated."""
+    return 0.25, mu_i * mu_r + (mu_r * m_i + mu_i * m_r)
 
 
-def _width(p: NDArray[np.float64]) -> float:
-    return float(p[1])
+@jit.model
+def smith_separable(mu_i, mu_r, m_i, m_r, z, l2):  # type: ignore[no-untyped-def]
+    return 0.25, (mu_i + m_i) * (mu_r + m_r)
 
 
-GGX = Model(
-    name="ggx",
-    parameters=(
-        Parameter("k_s", 0.0, 1.0, "specular weight", ("uniform", 0.0, 1.0), fixed=1.0),
-        Parameter("alpha", 1e-4, 1.0, "roughness, used as it is (not squared)", ("log_normal", math.log(0.2), 0.9)),
-        Parameter("f_0", 0.0, 1.0, "Schlick's reflectance at normal incidence", ("uniform", 0.0, 1.0)),
-    ),
-    function=ggx_f_r,
-    doc="GGX (Trowbridge-Reitz) facets, height-correlated Smith shadowing, Schlick's Fresnel term in h.v.",
-    reference="Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014; Schlick, CGF 13(3), 1994",
-    lobe_width=_width,
-)
+@jit.model
+def v_groove(mu_i, mu_r, m_i, m_r, z, l2):  # type: ignore[no-untyped-def]
+    # 2 mu_h mu / c = 4 (mu_i + mu_r) mu / l^2
+    most = mu_i * mu_r
+    low = mu_i if mu_i < mu_r else mu_r
+    g = 4.0 * z * low
+    return (g if g < l2 else l2), 4.0 * most * l2
+
+
+_SHADOWING = {"smith": smith, "smith_separable": smith_separable, "v_groove": v_groove}
+
+
+@functools.cache
+def _function(distribution: str, fresnel: str, shadowing: str, repeated: bool) -> Callable[..., float]:
+    """The scalar function of a set of choices; p holds k_s, alpha, (gamma), Fresnel's numbers, the derived ones."""
+    facets = FACETS[distribution]
+    first = 2 + len(facets.parameters)
+    at = first + len(FRESNEL[fresnel].parameters)
+    density, hidden, geometry = facets.density(at), facets.hidden(at), _SHADOWING[shadowing]
+    reflected = FRESNEL[fresnel].factor(first)
+
+    def once(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+        lit = (zi > LOWEST) & (zr > LOWEST)  # no branch: the loop vectorises
+        mu_i = zi if lit else 1.0
+        mu_r = zr if lit else 1.0
+        x, y, z = xi + xr, yi + yr, mu_i + mu_r
+        dx, dy, dz = xi - xr, yi - yr, mu_i - mu_r
+        s2 = x * x + y * y  # l^2 sin^2 theta_h
+        l2 = s2 + z * z
+        d_n, d_d = density(s2, z, l2, p)
+        f_n, f_d = reflected(l2, dx * dx + dy * dy + dz * dz, p)
+        m_i, m_r = hidden(mu_i, xi * xi + yi * yi, p), hidden(mu_r, xr * xr + yr * yr, p)
+        g_n, g_d = geometry(mu_i, mu_r, m_i, m_r, z, l2)
+        value = (p[0] * d_n * f_n * g_n) / (d_d * f_d * g_d)
+        return value if lit else 0.0
+
+    single = jit.model(once)
+    if not repeated:
+        return single  # type: ignore[no-any-return]
+    lost, numbers = again.lost(at + facets.count), at + facets.count
+
+    def more(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+        lit = (zi > LOWEST) & (zr > LOWEST)
+        mu_i = zi if lit else 1.0
+        mu_r = zr if lit else 1.0
+        value = single(xi, yi, zi, xr, yr, zr, p) + p[0] * p[numbers] * lost(mu_i, p) * lost(mu_r, p)
+        return value if lit else 0.0
+
+    return jit.model(more)  # type: ignore[no-any-return]
+
+
+def _kinks(p: Array, omega_r: Array) -> Array:
+    """Of v-grooves, where the less elevated direction changes and where its grooves begin to hide nothing.
+
+    The border for omega_i as the lower direction is no plane; the integrator finds that one by itself.
+    """
+    x, y, mu = omega_r
+    return np.array([[-x, -y, mu, 1.0 - 2.0 * mu * mu], [0.0, 0.0, 1.0, mu]])
+
+
+@functools.cache
+def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: str, name: str = "microfacet") -> Model:
+    """The model of a set of choices."""
+    repeated = multiple_scattering == "true"
+    if repeated and shadowing == "v_groove":
+        raise ParameterError(
+            "microfacet: multiple_scattering=True is defined with Smith's shadowing only, as it takes what v-grooves hide "
+            'for lost by their own facets; use shadowing="smith" or leave multiple_scattering out'
+        )
+    facets, reflectance = FACETS[distribution], FRESNEL[fresnel]
+    shape = 1 + len(facets.parameters)  # alpha and gamma
+    numbers = 1 + shape + len(reflectance.parameters)
+
+    def derived(p: Array) -> Array:
+        own = facets.derived(p[1 : 1 + shape])
+        if not repeated:
+            return own
+        average = reflectance.average(p[1 + shape : numbers])
+        made = np.concatenate((p[:numbers], own))
+        return np.concatenate((own, again.derived(distribution, shadowing, average, made, numbers)))
+
+    chosen = {
+        "distribution": distribution,
+        "fresnel": fresnel,
+        "shadowing": shadowing,
+        "multiple_scattering": multiple_scattering,
+    }
+    hiding = {"smith": "height-correlated Smith", "smith_separable": "separable Smith", "v_groove": "V-groove"}[shadowing]
+    return Model(
+        name=name,
+        parameters=(
+            Parameter("k_s", 0.0, 1.0, "specular weight", ("uniform", 0.0, 1.0), fixed=1.0),
+            Parameter("alpha", 1e-4, 1.0, "roughness, used as it is (not squared)", ("log_normal", math.log(0.2), 0.9)),
+            *facets.parameters,
+            *reflectance.parameters,
+        ),
+        function=_function(distribution, fresnel, shadowing, repeated),
+        doc=f"{facets.doc} facets, {hiding} shadowing, {reflectance.doc}"
+        + (", and light scattered several times." if repeated else "."),
+        reference="; ".join(
+            text for text in (
+                facets.reference, reflectance.reference, "Torrance & Sparrow, JOSA 57(9), 1967" * (shadowing == "v_groove"),
+                "Kulla & Conty, SIGGRAPH course, 2017" * repeated,
+            ) if text
+        ),
+        lobe_width=lambda p: facets.width(p[1 : 1 + shape]),
+        kinks=_kinks if shadowing == "v_groove" else None,
+        derived=derived if facets.count or repeated else None,
+        choices={} if name != "microfacet" else {k: v for k, v in chosen.items() if v != CHOICES[k][0]},
+    )  # fmt: skip
+
+
+GGX = build("ggx", "schlick", "smith", "false", name="ggx")
+BECKMANN = build("beckmann", "schlick", "smith", "false", name="beckmann")

@@ -1,0 +1,303 @@
+r"""How the facets of a rough mirror are tilted, and how much of them other facets hide: four distributions.
+
+D(h) is normalised, :math:`\int D\cos\theta_h\,\mathrm{d}\omega_h = 1`. With :math:`t = \tan\theta_h`,
+
+- beckmann: :math:`D = e^{-t^2/\alpha^2} / (\pi\alpha^2\cos^4\theta_h)`;
+- ggx: :math:`D = \alpha^2 / (\pi\,(\alpha^2\cos^2\theta_h + \sin^2\theta_h)^2)`;
+- gtr: :math:`D = C / (\alpha^2\cos^2\theta_h + \sin^2\theta_h)^\gamma`, gamma = 2 is ggx;
+- std: :math:`D = (1 + t^2/((\gamma-1)\alpha^2))^{-\gamma} / (\pi\alpha^2\cos^4\theta_h)`: Student's t distribution of
+  slopes; gamma = 2 is ggx, infinity beckmann.
+
+Smith's Lambda comes as :math:`M = \mu\Lambda`, the projected area of the facets seen from behind, which is finite at the
+horizon and a sum of nothing but positive terms. With y = mu / (alpha sin theta):
+
+- beckmann: :math:`M = \tfrac12\alpha s\,e^{-y^2} W(y)/\sqrt\pi` with :math:`W = 1 - \sqrt\pi\,y\,\mathrm{erfcx}(y)`, here a
+  polynomial in y / (y + 4), to 1e-16;
+- ggx: :math:`M = \tfrac12\alpha^2 s^2/(\sqrt{\mu^2+\alpha^2 s^2}+\mu)`;
+- std: exact by the incomplete beta function, tabulated when gamma is set, to 1e-13;
+- gtr: an integral over the slopes, tabulated when alpha and gamma are set, to 1e-13 (1e-10 below alpha = 1e-3).
+
+References
+----------
+.. [1] B. Walter, S. R. Marschner, H. Li, K. E. Torrance, "Microfacet Models for Refraction through Rough Surfaces", EGSR
+   2007, eqs. 25, 33 (Beckmann's and the GGX distribution).
+.. [2] E. Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014 (Lambda as an
+   integral over slopes; those of Beckmann's and the GGX distribution).
+.. [3] B. Burley, "Physically-Based Shading at Disney", SIGGRAPH course notes, 2012, appendix B (GTR).
+.. [4] M. Ribardiere, B. Bringier, D. Meneveaux, L. Simonot, "STD: Student's t-Distribution of Slopes for Microfacet Based
+   BSDFs", CGF 36(2), 2017. doi:10.1111/cgf.13137
+.. [5] T. S. Trowbridge, K. P. Reitz, "Average irregularity representation of a rough surface for ray reflection", JOSA
+   65(5), 1975. P. Beckmann, A. Spizzichino, The Scattering of Electromagnetic Waves from Rough Surfaces, 1963.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from gonio import jit
+from gonio.brdf import pieces
+from gonio.brdf.base import Parameter
+from gonio.brdf.elementary import exp, log, log_near, power
+from gonio.brdf.pieces import read as read_pieces
+
+Array = NDArray[np.float64]
+INV_PI = 1.0 / math.pi
+_REACH = 40.0  # e^-40 is nothing beside 1
+
+
+@dataclass(frozen=True)
+class Facets:
+    """A distribution of facets; its parameters stand behind k_s: alpha at p[1], gamma at p[2].
+
+    Attributes
+    ----------
+    parameters : tuple of Parameter
+        Behind alpha.
+    density : callable
+        Of the index of the derived numbers: compiled ``(s2, z, l2, p) -> (numerator, denominator)`` of D(h), for a vector
+        along h of square length l2, square tangential length s2 and height z.
+    hidden : callable
+        Of the same index: compiled ``(mu, s2, p) -> M``, s2 the square sine.
+    derived : callable
+        Of the values of alpha (and gamma): numbers that density and hidden find from that index on.
+    count : int
+        How many.
+    width : callable
+        Of the same values: half width of the lobe [rad], in units in which ggx has alpha.
+    pointed : bool
+        Whether M, as a function of the direction, has a broken power of s at the normal.
+    """
+
+    parameters: tuple[Parameter, ...]
+    density: Callable[[int], Any]
+    hidden: Callable[[int], Any]
+    derived: Callable[[Array], Array]
+    count: int
+    width: Callable[[Array], float]
+    doc: str
+    reference: str
+    pointed: bool = False
+
+
+# --- ggx ------------------------------------------------------------------------------------------------------------------
+
+
+@jit.model
+def ggx_density(s2, z, l2, p):  # type: ignore[no-untyped-def]
+    a2 = p[1] * p[1]
+    t = a2 * z * z + s2
+    return a2 * INV_PI * (l2 * l2), t * t
+
+
+@jit.model
+def ggx_hidden(mu, s2, p):  # type: ignore[no-untyped-def]
+    a2 = p[1] * p[1] * s2
+    return 0.5 * a2 / (math.sqrt(mu * mu + a2) + mu)
+
+
+# --- beckmann -------------------------------------------------------------------------------------------------------------
+
+
+@jit.model
+def beckmann_density(s2, z, l2, p):  # type: ignore[no-untyped-def]
+    a2, z2 = p[1] * p[1], z * z
+    return exp(-s2 / (a2 * z2)) * INV_PI * (l2 * l2), a2 * z2 * z2
+
+
+_W_FAR = 6.2  # in y; beyond, e^(-y^2) is nothing beside 1
+_W_KNEE = 4.0
+_W_SCALE = 2.0 * (_W_FAR + _W_KNEE) / _W_FAR
+
+
+@jit.model
+def beckmann_hidden(mu, s2, p):  # type: ignore[no-untyped-def]
+    a = p[1] * math.sqrt(s2)
+    y = mu / (a if a > 0.0 else 1.0)
+    t = mu / (mu + _W_KNEE * a) * _W_SCALE - 1.0
+    t = t if t < 1.0 else 1.0
+    # W / (2 sqrt(pi))
+    w = 5.564107984954418967e-12 + t * 1.761337688290242673e-12
+    w = -4.809084077199969985e-11 + t * w
+    w = -1.501593059302436984e-10 + t * w
+    w = 1.234186817538993477e-9 + t * w
+    w = 2.617367204831465717e-9 + t * w
+    w = -3.517616479451326312e-8 + t * w
+    w = 3.966737237822861671e-9 + t * w
+    w = 9.586956512315067702e-7 + t * w
+    w = -3.692557350002286258e-6 + t * w
+    w = -0.00001143717991081517724 + t * w
+    w = 0.0001913321044533722707 + t * w
+    w = -0.001131883130967695373 + t * w
+    w = 0.004457914038747794614 + t * w
+    w = -0.01317077341768245336 + t * w
+    w = 0.03034090978379962882 + t * w
+    w = -0.05471492720994432718 + t * w
+    w = 0.07498578492779029054 + t * w
+    w = -0.07025197166444464413 + t * w
+    w = 0.03284246914132163134 + t * w
+    return a * exp(-y * y) * w
+
+
+# --- std ------------------------------------------------------------------------------------------------------------------
+
+
+def _density_std(at: int) -> Any:
+    def std_density(s2, z, l2, p):  # type: ignore[no-untyped-def]
+        a2, gamma, z2 = p[1] * p[1], p[2], z * z
+        t2 = s2 / ((gamma - 1.0) * a2 * z2)
+        return exp(-gamma * log_near(1.0 + t2, t2)) * INV_PI * (l2 * l2), a2 * z2 * z2
+
+    return jit.model(std_density)
+
+
+_STD_TERMS = 21
+
+
+def _hidden_std(at: int) -> Any:
+    def std_hidden(mu, s2, p):  # type: ignore[no-untyped-def]
+        gamma = p[2]
+        a = p[1] * math.sqrt(s2)
+        b2 = (gamma - 1.0) * a * a
+        q2 = mu * mu + b2
+        q = math.sqrt(q2)
+        t = mu / (mu + p[at] * q) * p[at + 1] - 1.0
+        t = t if t < 1.0 else 1.0
+        w = p[at + 1 + _STD_TERMS]
+        for k in range(_STD_TERMS - 1, 0, -1):
+            w = w * t + p[at + 1 + k]
+        c2 = mu * mu / q2
+        return a * w * exp((gamma - 1.5) * log_near(b2 / q2, -c2))
+
+    return jit.model(std_hidden)
+
+
+def _derived_std(values: Array) -> Array:
+    r"""Of :math:`M = \tfrac12\alpha s\,\sigma^{2\gamma-3}\,T`: knee and scale of T's argument, and T / 2 as a polynomial.
+
+    With x = y / sqrt(gamma - 1), c = x / sqrt(1 + x^2), sigma^2 = 1 - c^2, N = Gamma(gamma - 1/2) / (sqrt(pi)
+    Gamma(gamma - 1)) and the tail Q = I_sigma^2(gamma - 1, 1/2) / 2 of Student's distribution,
+    T / 2 = N sqrt(gamma - 1) / (2 gamma - 3) - y Q / sigma^(2 gamma - 3); T has no singularity but at c = -1.
+    """
+    from scipy.special import betaincc
+
+    gamma = float(values[1])
+    knee = _W_KNEE / math.hypot(_W_KNEE, math.sqrt(gamma - 1.0))
+    farthest = math.sqrt(-math.expm1(-_REACH / (gamma - 1.5)))  # c at which sigma^(2 gamma - 3) = e^-40
+    end = farthest / (farthest + knee)
+    t = 0.5 * end * (1.0 + chebyshev.chebpts1(_STD_TERMS))
+    c = knee * t / (1.0 - t)
+    y = c / np.sqrt((1.0 - c) * (1.0 + c)) * math.sqrt(gamma - 1.0)
+    tail = 0.5 * betaincc(0.5, gamma - 1.0, c * c) * np.exp(-(gamma - 1.5) * np.log1p(-c * c))
+    half = _gamma_ratio(gamma - 1.0) * math.sqrt((gamma - 1.0) / math.pi) / (2.0 * gamma - 3.0) - y * tail
+    waves = chebyshev.chebvander(chebyshev.chebpts1(_STD_TERMS), _STD_TERMS - 1)
+    series = (2.0 / _STD_TERMS) * waves.T @ half
+    series[0] *= 0.5
+    return np.concatenate(([knee, 2.0 / end], chebyshev.cheb2poly(series)))
+
+
+def _gamma_ratio(z: float) -> float:
+    """Gamma(z + 1/2) / Gamma(z) for z > 0 to 1e-15: the recurrence up to 40, then the asymptotic series."""
+    factor = 1.0
+    while z < 40.0:
+        factor *= z / (z + 0.5)
+        z += 1.0
+    series = (-1 / 8, 1 / 128, 5 / 1024, -21 / 32768, -399 / 262144, 869 / 4194304, 39325 / 33554432)
+    return factor * math.sqrt(z) * (1.0 + math.fsum(c / z ** (k + 1) for k, c in enumerate(series)))
+
+
+# --- gtr ------------------------------------------------------------------------------------------------------------------
+
+_GTR_PIECES = 8
+
+
+def _density_gtr(at: int) -> Any:
+    def gtr_density(s2, z, l2, p):  # type: ignore[no-untyped-def]
+        t = p[1] * p[1] * z * z + s2
+        return p[at] * power(l2 / t, p[2]), 1.0
+
+    return jit.model(gtr_density)
+
+
+def _hidden_gtr(at: int) -> Any:
+    def gtr_hidden(mu, s2, p):  # type: ignore[no-untyped-def]
+        # M / s^2 in pieces of ln((mu + r) / b), r^2 = mu^2 + b^2 s^2
+        b = p[at + 1]
+        r = math.sqrt(mu * mu + b * b * s2)
+        return s2 * read_pieces(log((mu + r) / b) * p[at + 2], p, at + 3, _GTR_PIECES)
+
+    return jit.model(gtr_hidden)
+
+
+def gtr_normalisation(alpha: float, gamma: float) -> float:
+    """C = (gamma - 1) (alpha^2 - 1) / (pi (1 - alpha^(2 - 2 gamma))), continued to gamma = 1 and to alpha = 1."""
+
+    def slope(x: float) -> float:  # (e^x - 1) / x
+        return math.expm1(x) / x if x != 0.0 else 1.0
+
+    length = -2.0 * math.log(alpha)
+    return INV_PI * slope(-length) / slope((gamma - 1.0) * length)
+
+
+def _derived_gtr(values: Array) -> Array:
+    r"""C, scale b and pieces per unit of the logarithm, and the table of M / s^2.
+
+    With the density of slopes :math:`P(t) = C\,(1+t^2)^{\gamma-2} (\alpha^2+t^2)^{-\gamma}` [2]_ and y = cot theta,
+    :math:`M = 2 s y^3 \int_0^\infty x\,(x - \arctan x)\,P(y\sqrt{1+x^2})\,\mathrm{d}x`, here by equal steps of ln x.
+    """
+    alpha, gamma = (float(v) for v in values)
+    c = gtr_normalisation(alpha, gamma)
+    b = min(alpha, 0.5)
+    span = math.log(2.0 / b)
+    reached = b * np.exp(pieces.nodes(_GTR_PIECES) * (span / _GTR_PIECES)).ravel()[:, None]  # mu + r
+    # (mu + r)^2 = E^2 solved for mu; at the far end y -> infinity, s from y
+    mu = (reached - b) * (reached + b) / (reached + np.sqrt(reached**2 * (1.0 - b * b) + b**4))
+    y = mu / np.sqrt((1.0 - mu) * (1.0 + mu))
+    step = 0.25
+    u = np.arange(-8.0, 37.0 + math.log(1.0 / float(y.min())), step)
+    x = np.exp(u)
+    t2 = y * y * (1.0 + x * x)
+    density = c * np.exp((gamma - 2.0) * np.log1p(t2) - gamma * np.log(alpha * alpha + t2))
+    # x (x - arctan x) dx = x^2 (x - arctan x) du
+    bracket = np.where(x < 0.02, x**3 * (1 / 3 - x * x / 5 + x**4 / 7 - x**6 / 9), x - np.arctan(x))
+    m = 2.0 * step * y[:, 0] ** 3 * (density @ (x * x * bracket))  # M / s
+    per_square = (m * np.sqrt(1.0 + y[:, 0] ** 2)).reshape(_GTR_PIECES, -1)
+    return np.concatenate(([c, b, _GTR_PIECES / span], pieces.table(per_square)))
+
+
+# --- all ------------------------------------------------------------------------------------------------------------------
+
+
+def _gamma(lower: float, upper: float, doc: str) -> Parameter:
+    return Parameter("gamma", lower, upper, doc, ("log_normal", math.log(2.0), 0.5))
+
+
+_WALTER = "Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014"
+
+FACETS = {
+    "beckmann": Facets(
+        (), lambda at: beckmann_density, lambda at: beckmann_hidden, lambda v: np.empty(0), 0, lambda v: float(v[0]),
+        "Beckmann", f"Beckmann & Spizzichino, 1963; {_WALTER}",
+    ),
+    "ggx": Facets(
+        (), lambda at: ggx_density, lambda at: ggx_hidden, lambda v: np.empty(0), 0, lambda v: float(v[0]),
+        "GGX (Trowbridge-Reitz)", f"Trowbridge & Reitz, JOSA 65(5), 1975; {_WALTER}",
+    ),
+    "gtr": Facets(
+        (_gamma(0.0, 10.0, "exponent of the tail: 2 is ggx, 1 Berry's"),),
+        _density_gtr, _hidden_gtr, _derived_gtr, 3 + _GTR_PIECES * pieces.ROW,
+        lambda v: float(v[0]) * min(1.0, math.sqrt(2.0 ** (1.0 / max(v[1], 0.5)) - 1.0) / 0.6436),
+        "GTR (generalised Trowbridge-Reitz)", "Burley, SIGGRAPH course, 2012; Heitz, JCGT 3(2), 2014",
+    ),
+    "std": Facets(
+        (_gamma(1.51, 1e6, "exponent of the tail: 2 is ggx, infinity Beckmann's"),),
+        _density_std, _hidden_std, _derived_std, 2 + _STD_TERMS, lambda v: float(v[0]) * min(1.0, math.sqrt(v[1] - 1.0)),
+        "Student's t", "Ribardiere et al., CGF 36(2), 2017", pointed=True,
+    ),
+}  # fmt: skip

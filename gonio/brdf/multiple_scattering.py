@@ -1,0 +1,181 @@
+r"""Light that facets scatter several times, after Kulla and Conty: what is lost at the first time, given back diffusely.
+
+.. math:: f_{ms} = \frac{\bar F^2 \bar E}{1-\bar F(1-\bar E)}\,\frac{(1-E(\mu_i))\,(1-E(\mu_r))}{\pi\,(1-\bar E)}
+
+E is the directional albedo of facets that reflect all, :math:`\bar E = 2\int E\mu\,\mathrm{d}\mu`, and :math:`\bar F` the
+mean of their reflectance. With F = 1 nothing is lost; the model is reciprocal.
+
+E is tabulated when alpha and gamma are set. What is integrated is the loss itself, over the facets h that are seen: as
+Smith's masking sees an area of just 1,
+
+.. math:: 1 - E = \frac1{\mu_r}\int D(h)\,(\omega_r\cdot h)\,(G_1(\omega_r) - G_2)\,\mathrm{d}\omega_h ,
+
+whose integrand is positive, so that the small losses of smooth surfaces keep their digits. Rings of equal theta_h are split
+where they reach the horizon, touch it or leave it; between, and along the rings, nodes crowd double-exponentially towards
+these places [2]_, where the integrand has layers as thin as alpha and mu_r.
+
+References
+----------
+.. [1] C. Kulla, A. Conty, "Revisiting Physically Based Shading at Imageworks", SIGGRAPH course notes, 2017.
+.. [2] H. Takahasi, M. Mori, "Double Exponential Formulas for Numerical Integration", Publ. RIMS 9(3), 1974.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio import jit
+from gonio.brdf import pieces
+from gonio.brdf.elementary import log
+from gonio.brdf.facets import FACETS
+from gonio.brdf.pieces import read as read_pieces
+
+Array = NDArray[np.float64]
+_PIECES = 18
+_NEAR = 1e-8  # in alphas: cosines below are near the horizon
+_LOW = 1e-6  # in alphas: slopes below are none
+_PANEL = 1.5  # longest panel in ln tan(theta_h / 2)
+
+
+def lost(at: int) -> Any:
+    """Compiled ``(mu, p) -> 1 - E(mu)`` from the numbers of `derived` that begin at p[at]."""
+
+    def loss(mu, p):  # type: ignore[no-untyped-def]
+        x = log(mu * p[at + 1] + 1.0) * p[at + 2]
+        return read_pieces(x, p, at + 3, _PIECES)
+
+    return jit.model(loss)
+
+
+def derived(distribution: str, shadowing: str, average: float, p: Array, at: int) -> Array:
+    """Weight of the product of losses, two scales of ln mu, and the table of 1 - E.
+
+    Parameters
+    ----------
+    distribution, shadowing : str
+    average : float
+        Mean of Fresnel's reflectance.
+    p : ndarray
+        Parameters and the numbers derived from them, for the distribution's functions.
+    at : int
+        Index of the latter.
+    """
+    near = _NEAR * float(p[1])
+    span = math.log1p(1.0 / near)
+    x = pieces.nodes(_PIECES).ravel() * (span / _PIECES)
+    mu = np.minimum(near * np.expm1(x), 1.0)
+    found = np.empty(len(mu))
+    _losses(distribution, shadowing, at)(mu, p, *rules(FACETS[distribution].pointed), found)
+    table = pieces.table(found.reshape(_PIECES, -1))
+    # 1 - E averaged: 2 mu dmu, mu = near (e^x - 1), of the table
+    g, w = np.polynomial.legendre.leggauss(24)
+    at_x = (np.arange(_PIECES)[:, None] + 0.5 * (1.0 + g)) * (span / _PIECES)
+    rows = np.polynomial.polynomial.polyval(g, table.reshape(_PIECES, -1).T, tensor=True)
+    loss = float(np.sum(rows * w * near * near * np.expm1(at_x) * np.exp(at_x)) * (span / _PIECES))
+    kept = 1.0 - loss
+    weight = average * average * kept / (1.0 - average * loss) / (math.pi * loss)
+    return np.concatenate(([weight, 1.0 / near, _PIECES / span], table))
+
+
+def tanh_sinh(step: float = 0.08, reach: float = 3.9) -> Array:
+    """Nodes on [0, 1] by their distance from the nearer end, negative from the upper one, and weights; shape (2, n)."""
+    t = step * np.arange(-round(reach / step), round(reach / step) + 1)
+    e = np.exp(-math.pi * np.sinh(np.abs(t)))
+    distance = np.where(t > 0, -e / (1.0 + e), e / (1.0 + e))
+    return np.stack((distance, step * math.pi * np.cosh(t) * e / (1.0 + e) ** 2))
+
+
+def gauss(count: int = 16) -> Array:
+    """The same for Gauss and Legendre's rule."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    return np.stack((np.where(x < 0, 0.5 * (1.0 + x), -0.5 * (1.0 - x)), 0.5 * w))
+
+
+def even(step: float = 0.075, reach: float = 3.9) -> Array:
+    """tanh-sinh for functions that are even about 0: distances from 1 and weights."""
+    t = step * (np.arange(round(reach / step)) + 0.5)
+    e = np.exp(-math.pi * np.sinh(t))
+    return np.stack((2.0 * e / (1.0 + e), step * math.pi * np.cosh(t) * 2.0 * e / (1.0 + e) ** 2))
+
+
+@functools.cache
+def rules(pointed: bool) -> tuple[Array, Array, Array]:
+    """Along rings; for panels of theta_h with an edge, and without."""
+    both = tanh_sinh(0.07)
+    whole = np.stack((np.where(both[0] < 0, -both[0], 1.0 - both[0]), both[1]))
+    return whole if pointed else even(), tanh_sinh(0.05 if pointed else 0.075), gauss()
+
+
+@functools.cache
+def _losses(distribution: str, shadowing: str, at: int) -> Any:
+    density, hidden = FACETS[distribution].density(at), FACETS[distribution].hidden(at)
+    correlated, pointed = shadowing == "smith", FACETS[distribution].pointed
+
+    @jit.model
+    def share(mu, mu_i, m_r, p):  # type: ignore[no-untyped-def]
+        """(G_1 - G_2) (mu + m_r) / mu"""
+        m_i = hidden(mu_i, max(1.0 - mu_i * mu_i, 0.0), p)
+        if correlated:
+            return mu * m_i / (mu * mu_i + (mu * m_i + mu_i * m_r))
+        return m_i / (mu_i + m_i)
+
+    @jit.part
+    def bounds(theta, theta_r, a, b, along, across):  # type: ignore[no-untyped-def]
+        """Of phi: where omega_i sets and where the facets do; the smallest mu_i if it never sets."""
+        end = math.acos(min(max(-a / b, -1.0), 1.0))
+        last = math.acos(min(max(-along / across, -1.0), 1.0))
+        least = max(math.cos(2.0 * theta + theta_r), 0.0)
+        end = math.pi if least > 0.0 else end
+        end = 0.0 if math.cos(2.0 * theta - theta_r) <= 0.0 else end
+        return end, last, least
+
+    def losses(mu, p, along_ring, edged, smooth, out):  # type: ignore[no-untyped-def]
+        low, quarter = math.log(0.5 * _LOW * p[1]), 0.5 * math.pi
+        edges = np.empty(5)
+        for j in range(mu.size):
+            m = mu[j]
+            s = math.sqrt(max((1.0 - m) * (1.0 + m), 0.0))
+            m_r, theta_r, up = hidden(m, s * s, p), math.atan2(s, m), math.atan2(m, s)
+            # rings begin to reach the horizon, begin to have facets unseen, are all below the horizon
+            edges[0], edges[1], edges[2], edges[3] = 0.5 * up, up, 0.5 * (quarter + theta_r), quarter
+            edges[4] = 0.5 * theta_r if pointed else quarter  # the ring has the facet that mirrors to the normal
+            edges.sort()
+            total, begin, sharp = 0.0, low, False
+            for i in range(5):
+                far_end = math.log(math.tan(0.5 * edges[i])) if edges[i] < quarter else 0.0
+                if far_end - begin < 1e-13:
+                    continue
+                count = int((far_end - begin) / _PANEL) + 1
+                width = (far_end - begin) / count
+                for n in range(count):
+                    rule = edged if (n == 0 and sharp) or (n == count - 1 and far_end < 0.0) else smooth
+                    for k in range(rule.shape[1]):
+                        gap = rule[0, k] * width
+                        theta = 2.0 * math.atan(math.exp(begin + n * width + (gap if gap > 0.0 else width + gap)))
+                        st, ct = math.sin(theta), math.cos(theta)
+                        a, b = m * math.cos(2.0 * theta), s * math.sin(2.0 * theta)  # mu_i = a + b cos(phi)
+                        along, across = m * ct, s * st  # omega_r . h = along + across cos(phi)
+                        end, last, least = bounds(theta, theta_r, a, b, along, across)
+                        # sin(phi / 2) = sin(end / 2) v, along_ring[0] = 1 - v; the integrand is even in v
+                        sine, cosine = math.sin(0.5 * end), math.cos(0.5 * end)
+                        sine2, cosine2 = sine * sine, cosine * cosine if least == 0.0 else 0.0
+                        seen = 0.0
+                        for l in range(along_ring.shape[1] if end > 0.0 else 0):
+                            far = sine2 * along_ring[0, l] * (2.0 - along_ring[0, l])  # (cos(phi) - cos(end)) / 2
+                            towards = along + across * (2.0 * (far + cosine2) - 1.0)
+                            value = towards * share(m, least + 2.0 * b * far, m_r, p)
+                            seen += along_ring[1, l] * value / math.sqrt(cosine2 + far)
+                        seen *= 2.0 * sine
+                        if last > end:
+                            seen += along * (last - end) + across * (math.sin(last) - math.sin(end))
+                        d_n, d_d = density(st * st, ct, 1.0, p)
+                        total += 2.0 * width * rule[1, k] * st * st * seen * d_n / (d_d * (m + m_r))
+                begin, sharp = far_end, True
+            out[j] = total
+
+    return jit.kernel(losses)
