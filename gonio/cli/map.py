@@ -56,7 +56,7 @@ def map_(
         source = steps.scene_source(config)
         if config.viewer is not None and any(isinstance(part, EnvironmentMap) for part in source.parts):
             output.warn(
-                f"{scene}: with the viewer off axis, an environment map costs up to a second for each of the "
+                f"{scene}: with the viewer off axis, an environment map can cost seconds for each of the "
                 f"{config.n[0] * config.n[1]} gradients; a smaller [grid] n or a larger rtol shortens it"
             )
         made, values = steps.compute_map(
