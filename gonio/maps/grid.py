@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Method = Literal["auto", "integrate", "interpolate"]
 CONFIDENCE = 0.68
 _QUANTILES = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
-_SMALL = 0.1  # half angle of a disk [rad] below which it is a small source
+_SMALL = 0.02  # half angle of a disk [rad] below which it is drawn as a beam is
 _BAND_RTOL = 1e-4  # far below the width of any measured band
 
 
