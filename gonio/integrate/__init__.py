@@ -105,7 +105,7 @@ def reflectance_map(
     value, error = np.zeros(gradients.size), np.zeros(gradients.size)
     impulses: list[tuple[float, float, float]] = []
     steps = plan(brdf, Source.of(source))
-    run = Run(gradients, None if tangent is None else np.ravel(tangent), rtol, atol / max(1, len(steps)), threads)
+    run = Run(gradients, None if tangent is None else np.ravel(tangent), rtol, atol / max(1, len(steps)), threads, steps)
     for step in sorted(steps, key=lambda s: s.method is Method.RINGS):  # these use what is left of the tolerance
         start = time.perf_counter() - jit.getting_ready_s()
         if step.method is Method.IMPULSE:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gonio.fields import EnvironmentMap, Field
-from gonio.integrate import closed_forms, disk, radial
+from gonio.integrate import closed_forms, disk, quadtree, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
@@ -29,6 +29,8 @@ _FEW = 64  # gradients up to which a table in theta_n does not pay
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
 _TEXELS = 512  # of a bilinear map up to which its cells are few
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
+_SAMPLE_OF_TREE = 0.015
+_MANY = 1 << 19  # gradients from which on a quadtree pays
 
 
 @dataclass
@@ -44,6 +46,8 @@ class Run:
         Tolerance of each step.
     threads : int, optional
         None: all cores.
+    steps : list of Step
+        All of them: some are carried out together.
     """
 
     gradients: Gradients
@@ -51,6 +55,7 @@ class Run:
     rtol: float
     atol: float
     threads: int | None
+    steps: list[Step] = field(default_factory=list)
 
     def add(self, step: Step, value: Array, error: Array) -> float:
         """Add one step's value and error (n,); returns its largest relative error."""
@@ -59,7 +64,12 @@ class Run:
         if by_tile is not None:
             return max(tiling.run(lambda tile: by_tile(tile, value, error), self.gradients.tiles(), count), default=0.0)
         if isinstance(step.part, Cap) and step.method is Method.GENERAL and disk.suits(step.term, step.part):
-            return self._disk(step, step.part, count, value, error)
+            if not self._by_tree(step):
+                return self._disk(step, step.part, count, value, error)
+            together = [other for other in self.steps if other.part is step.part and self._by_tree(other)]
+            if step is not together[0]:
+                return together[0].error
+            return self._tree(together, step.part, count, value, error)
         if step.method is Method.RINGS and isinstance(step.part, Field):
             return self._rings(step, step.part, count, value, error)
         elements = self.gradients.elements()
@@ -99,6 +109,38 @@ class Run:
             value[left] += v
             error[left] += e
             worst = max(worst, float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0))))
+        return worst
+
+    def _by_tree(self, step: Step) -> bool:
+        cap = step.part
+        if not (isinstance(cap, Cap) and step.method is Method.GENERAL and self.gradients.size >= _MANY):
+            return False
+        return disk.suits(step.term, cap) and step.term.plain
+
+    def _tree(self, steps: list[Step], cap: Cap, threads: int, value: Array, error: Array) -> float:
+        """Terms under one disk: their sum from polynomials on squares of normals; where there are none, by `_disk`."""
+
+        def sample(p: Array, q: Array, rtol: float = _SAMPLE_OF_TREE * self.rtol) -> tuple[Array, Array]:
+            v, e = np.zeros(p.size), np.zeros(p.size)
+            run = Run(Gradients(p, q), None, rtol, 0.0, threads)
+            for step in steps:
+                run._disk(step, cap, threads, v, e)
+            return v, e
+
+        grid = self.gradients
+        width = min(step.term.lobe_width() or 10.0 for step in steps)
+        tree = quadtree.build(cap, width, grid, sample, self.rtol)
+        done = tiling.run(lambda tile: tree.add(grid, tile, self.rtol, value, error), grid.tiles(), threads)
+        worst = max(relative for relative, _ in done)
+        left = np.concatenate([index for _, index in done])
+        if left.size:
+            some = grid.select(left)
+            v, e = sample(some.p, some.q, self.rtol)
+            value[left] += v
+            error[left] += e
+            worst = max(worst, _largest(e, v, 0.0))
+        for step in steps:
+            step.reason += "; many gradients: from polynomials on squares of normals, all terms together"
         return worst
 
     def _rings(self, step: Step, field: Field, threads: int, value: Array, error: Array) -> float:
