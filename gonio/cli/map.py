@@ -53,6 +53,11 @@ def map_(
             if target is not None:
                 _make_folder(target)
         brdf, posterior, origin = steps.scene_brdf(config, scene.parent)
+        grained = next((term.model.name for term in brdf.terms if not term.model.isotropic), None)
+        if grained is not None and config.tangent is None:
+            raise ConfigurationError(
+                f"{scene}: {grained} is anisotropic; say how its grain runs: rotation_deg = 0 under [surface] is along x"
+            )
         source = steps.scene_source(config)
         if config.viewer is not None and any(isinstance(part, EnvironmentMap) for part in source.parts):
             output.warn(

@@ -28,7 +28,8 @@ from gonio.config.rig import (
     load_rig,
     parse_rig,
 )
-from gonio.config.scene import BRDFConfig, SceneConfig, SourceConfig, load_scene, parse_scene
+from gonio.config.scene import BRDFConfig, SceneConfig, load_scene, parse_scene
+from gonio.config.sources import SourceConfig
 
 __all__ = [
     "AxisConfig",

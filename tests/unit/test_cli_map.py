@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -10,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import gonio
+from gonio.brdf import families
 from gonio.cli.main import main
 from gonio.cli.units import fit_options
 from gonio.errors import ConfigurationError
@@ -105,6 +108,34 @@ def test_files_of_the_scene_and_of_the_command_line(tmp_path: Path, capsys: pyte
     assert ".png" in capsys.readouterr().err
     assert main(["map", str(file), "--out", str(file / "map.nc")]) == 6
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_grain_is_turned_with_the_surface_and_kept_in_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """f_r = (1 + x_i^2) / pi, brighter for light along the grain, whoever looks: one line gives a flat surface's R."""
+
+    def brushed(omega_i: np.ndarray, omega_r: np.ndarray) -> np.ndarray:
+        return np.where((omega_i[:, 2] > 0) & (omega_r[:, 2] > 0), (1 + omega_i[:, 0] ** 2) / np.pi, 0.0)
+
+    (term,) = gonio.brdf.from_function(brushed, name="brushed", isotropic=False).terms
+    monkeypatch.setitem(families.FAMILIES, "brushed", families.Family("brushed", lambda: term.model))
+    file = tmp_path / "scene.toml"
+    text = '[brdf]\nmodel = "brushed"\n[[source]]\nkind = "collimated"\ntheta_deg = 60\nphi_deg = 100\n[grid]\nn = 3\n'
+    file.write_text(text)
+    assert main(["map", str(file), "--out", str(tmp_path / "map.nc")]) == 2
+    assert "rotation_deg = 0 under [surface]" in capsys.readouterr().err
+    for viewer in ("", "[viewer]\ntheta_deg = 40\nphi_deg = 10\n"):
+        file.write_text(text + "[surface]\nrotation_deg = 70\n" + viewer)
+        assert main(["map", str(file), "--out", str(tmp_path / "map.nc")]) == 0
+        made = ReflectanceMap.load(tmp_path / "map.nc")
+        # cos 60 (1 + sin^2 60 cos^2(100 - 70)) / pi
+        assert made.value[1, 1] == pytest.approx(0.5 * (1 + 0.75 * 0.75) / math.pi, rel=1e-12)
+        assert made.tangent == pytest.approx(math.radians(70)) and (made.viewer is None) == (not viewer)
+        whole = dataclasses.replace(
+            made, brdf=gonio.BRDF([term]), source=gonio.source.make("collimated", theta=math.pi / 3, phi=math.radians(100))
+        )
+        np.testing.assert_allclose(whole.evaluate(made.p[None, :], made.q[:, None]).value, made.value, rtol=1e-12)
 
 
 def test_angles_of_a_fit_are_written_in_degrees() -> None:

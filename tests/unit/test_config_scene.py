@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import gonio
 from gonio import config, source
 from gonio.cli.main import main
-from gonio.config.scene import SOURCES
+from gonio.config.sources import SOURCES
 from gonio.errors import ConfigurationError, DatasetError, GonioError
 
 BRDF = '[brdf]\nmodel = "lambertian"\nalbedo = 0.5\n'

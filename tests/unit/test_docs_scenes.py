@@ -44,7 +44,7 @@ def scene_with(text: str) -> str:
 
 
 def test_the_page_shows_every_kind_of_source() -> None:
-    from gonio.config.scene import SOURCES
+    from gonio.config.sources import SOURCES
 
     assert {kind for scene in SCENES for kind in re.findall(r'kind = "(\w+)"', scene)} == set(SOURCES)
 
