@@ -194,6 +194,11 @@ def _features(p: Array, omega_r: Array) -> Array:
     return np.array(rows).reshape(-1, 4)
 
 
+def _width(p: Array) -> float:
+    """No lobe; seen at a grazing angle, 1 / (mu_i + mu_r) is a layer at the horizon, which lobes have too."""
+    return 1.0
+
+
 def _tau(p: Array) -> Array:
     return np.array([math.tan(p[5])])
 
@@ -214,6 +219,7 @@ def hapke(H: str) -> Model:
         function=_FUNCTIONS[H],
         doc=f"Particulate surface: phase function, opposition peak, multiple scattering (H of {H}), roughness.",
         reference="Hapke, J. Geophys. Res. 86, 1981; Icarus 59, 1984; Icarus 67, 1986; Icarus 157, 2002",
+        lobe_width=_width,
         kinks=_kinks,
         features=_features,
         derived=_tau,

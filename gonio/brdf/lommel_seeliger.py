@@ -17,9 +17,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gonio import jit
 from gonio.brdf.base import Model, Parameter
 
+Array = NDArray[np.float64]
 INV_FOUR_PI = 0.25 / math.pi
 
 
@@ -30,10 +34,16 @@ def lommel_seeliger_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, z
     return p[0] * INV_FOUR_PI / total if lit else 0.0
 
 
+def _width(p: Array) -> float:
+    """No lobe; seen at a grazing angle, f_r is a layer at the horizon, which lobes have too."""
+    return 1.0
+
+
 LOMMEL_SEELIGER = Model(
     name="lommel_seeliger",
     parameters=(Parameter("w", 0.0, 1.0, "single-scattering albedo", ("uniform", 0.0, 1.0)),),
     function=lommel_seeliger_f_r,
     doc="w / (4 pi) / (cos theta_i + cos theta_r): single scattering in a deep layer.",
     reference="Seeliger, Sitzungsber. Akad. Wiss. Muenchen 18, 1888; Hapke, J. Geophys. Res. 86, 1981",
+    lobe_width=_width,
 )

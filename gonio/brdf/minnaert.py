@@ -24,6 +24,7 @@ from gonio.brdf.elementary import power
 Array = NDArray[np.float64]
 INV_PI = 1.0 / math.pi
 _LEAST = 1e-300  # of the product of the cosines: f_r stays finite
+_GRADED = np.array([[0.0, 0.0, 1.0, height] for height in (0.03, 1e-3, 3e-5)])
 
 
 @jit.model
@@ -36,10 +37,9 @@ def minnaert_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: floa
 
 
 def _kinks(p: Array, omega_r: Array) -> Array:
-    """The horizon, where mu_i^(k - 1) has no derivatives, unless k - 1 is 0 or 1."""
-    if p[1] in (1.0, 2.0):
-        return np.empty((*omega_r.shape[:-1], 0, 4))
-    return np.broadcast_to(np.array([[0.0, 0.0, 1.0, 0.0]]), (*omega_r.shape[:-1], 1, 4))
+    """None, but unless k - 1 is 0 or 1 mu_i^(k - 1) has no derivatives at the horizon: panels grow from there."""
+    rows = np.empty((0, 4)) if p[1] in (1.0, 2.0) else _GRADED
+    return np.broadcast_to(rows, (*omega_r.shape[:-1], len(rows), 4))
 
 
 MINNAERT = Model(
