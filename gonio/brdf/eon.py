@@ -60,12 +60,14 @@ def eon_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p:
     # 1 + s = (|(wi + wr)_xy|^2 + mu_i^2 + mu_r^2) / 2
     x, y = xi + xr, yi + yr
     behind = 1.0 - r + r * 0.5 * (x * x + y * y + mu_i * mu_i + mu_r * mu_r)
-    single = 1.0 + r * s / largest if s > 0.0 else behind
+    ahead = 1.0 + r * s / largest
+    single = ahead if s > 0.0 else behind
     mean = a * (1.0 + K_2 * r)
     multiple = albedo * mean / (1.0 - albedo * (a * r * (K_1 - K_2)))  # 1 - mean = a r (K_1 - K_2)
     # (1 - E_i) (1 - E_r) / (1 - mean), over a
     again = r / (K_1 - K_2) * _left(mu_i, xi * xi + yi * yi) * _left(mu_r, xr * xr + yr * yr)
-    return albedo * INV_PI * a * (single + multiple * again) if lit else 0.0
+    value = albedo * INV_PI * a * (single + multiple * again)
+    return value if lit else 0.0
 
 
 EON = Model(

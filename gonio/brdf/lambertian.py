@@ -12,7 +12,8 @@ INV_PI = 1.0 / math.pi
 
 @jit.model
 def f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
-    return p[0] * INV_PI if (zi > 0.0) & (zr > 0.0) else 0.0
+    value = p[0] * INV_PI
+    return value if (zi > 0.0) & (zr > 0.0) else 0.0
 
 
 LAMBERTIAN = Model(

@@ -49,13 +49,15 @@ TWO_OVER_PI = 2.0 / math.pi
 def qualitative_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
     albedo, s2 = p[0], p[1] * p[1]
     lit = (zi > 0.0) & (zr > 0.0)
+    mu_i = zi if lit else 1.0
+    mu_r = zr if lit else 1.0
     a = 1.0 - 0.5 * s2 / (s2 + 0.33)
     b = 0.45 * s2 / (s2 + 0.09)
     s = xi * xr + yi * yr  # sin theta_i sin theta_r cos dphi
     s = s if s > 0.0 else 0.0
-    largest = zi if zi > zr else zr
-    largest = largest if lit else 1.0
-    return albedo * INV_PI * (a + b * s / largest) if lit else 0.0
+    largest = mu_i if mu_i > mu_r else mu_r
+    value = albedo * INV_PI * (a + b * s / largest)
+    return value if lit else 0.0
 
 
 @jit.model

@@ -54,7 +54,9 @@ def transmitted(mu: float, n2: float, m2: float) -> float:
     """1 - F for a cosine mu from outside; n2 = n^2, m2 = n^2 - 1."""
     q = math.sqrt(m2 + mu * mu)  # n cos theta_t
     s, p = mu + q, n2 * mu + q
-    return 2.0 * mu * q * (1.0 / (s * s) + n2 / (p * p))
+    both = 1.0 / (s * p)
+    s, p = s * both, p * both  # 1 / p, 1 / s
+    return 2.0 * mu * q * (p * p + n2 * s * s)
 
 
 @jit.model
@@ -64,7 +66,8 @@ def plastic_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float
     mu_i = zi if lit else 1.0
     mu_r = zr if lit else 1.0
     n2, m2 = n * n, (n - 1.0) * (n + 1.0)
-    return scale * transmitted(mu_i, n2, m2) * transmitted(mu_r, n2, m2) if lit else 0.0
+    value = scale * transmitted(mu_i, n2, m2) * transmitted(mu_r, n2, m2)
+    return value if lit else 0.0
 
 
 def _scale(p: Array) -> Array:
