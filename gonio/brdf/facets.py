@@ -73,6 +73,10 @@ class Facets:
         Of the same values: half width of the lobe [rad], in units in which ggx has alpha.
     pointed : bool
         Whether M, as a function of the direction, has a broken power of s at the normal.
+    steep : callable
+        Of the parameter array: D grows towards the horizon no faster than the cosine to the power 1 / steep - 1.
+    tip, pieces : float, int
+        Sine below which the albedo is smooth at the normal, and in how many pieces it is tabulated.
     """
 
     parameters: tuple[Parameter, ...]
@@ -84,6 +88,9 @@ class Facets:
     doc: str
     reference: str
     pointed: bool = False
+    steep: Callable[[Array], float] = lambda p: 1.0
+    tip: float = 1.0
+    pieces: int = 18
 
 
 # --- ggx ------------------------------------------------------------------------------------------------------------------
@@ -259,7 +266,7 @@ def _derived_gtr(values: Array) -> Array:
     # (mu + r)^2 = E^2 solved for mu; at the far end y -> infinity, s from y
     mu = (reached - b) * (reached + b) / (reached + np.sqrt(reached**2 * (1.0 - b * b) + b**4))
     y = mu / np.sqrt((1.0 - mu) * (1.0 + mu))
-    step = 0.25
+    step = 0.25 / math.sqrt(max(1.0, 0.4 * gamma))
     u = np.arange(-8.0, 37.0 + math.log(1.0 / float(y.min())), step)
     x = np.exp(u)
     t2 = y * y * (1.0 + x * x)
@@ -283,7 +290,7 @@ _WALTER = "Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014"
 FACETS = {
     "beckmann": Facets(
         (), lambda at: beckmann_density, lambda at: beckmann_hidden, lambda v: np.empty(0), 0, lambda v: float(v[0]),
-        "Beckmann", f"Beckmann & Spizzichino, 1963; {_WALTER}",
+        "Beckmann", f"Beckmann & Spizzichino, 1963; {_WALTER}", pointed=True, tip=0.05, pieces=30,
     ),
     "ggx": Facets(
         (), lambda at: ggx_density, lambda at: ggx_hidden, lambda v: np.empty(0), 0, lambda v: float(v[0]),
@@ -299,5 +306,6 @@ FACETS = {
         (_gamma(1.51, 1e6, "exponent of the tail: 2 is ggx, infinity Beckmann's"),),
         _density_std, _hidden_std, _derived_std, 2 + _STD_TERMS, lambda v: float(v[0]) * min(1.0, math.sqrt(v[1] - 1.0)),
         "Student's t", "Ribardiere et al., CGF 36(2), 2017", pointed=True,
+        steep=lambda p: max(1.0, 1.0 / (2.0 * float(p[2]) - 3.0)), tip=1e-10, pieces=44,
     ),
 }  # fmt: skip

@@ -98,13 +98,15 @@ def _function(distribution: str, fresnel: str, shadowing: str, repeated: bool) -
     single = jit.model(once)
     if not repeated:
         return single  # type: ignore[no-any-return]
-    lost, numbers = again.lost(at + facets.count), at + facets.count
+    lost, numbers = again.lost(facets, at + facets.count), at + facets.count
 
     def more(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
         lit = (zi > LOWEST) & (zr > LOWEST)
         mu_i = zi if lit else 1.0
         mu_r = zr if lit else 1.0
-        value = single(xi, yi, zi, xr, yr, zr, p) + p[0] * p[numbers] * lost(mu_i, p) * lost(mu_r, p)
+        value = single(xi, yi, zi, xr, yr, zr, p) + p[0] * p[numbers] * lost(mu_i, xi * xi + yi * yi, p) * lost(
+            mu_r, xr * xr + yr * yr, p
+        )
         return value if lit else 0.0
 
     return jit.model(more)  # type: ignore[no-any-return]
@@ -138,7 +140,7 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
             return own
         average = reflectance.average(p[1 + shape : numbers])
         made = np.concatenate((p[:numbers], own))
-        return np.concatenate((own, again.derived(distribution, shadowing, average, made, numbers)))
+        return np.concatenate((own, again.derived(facets, shadowing, average, made, numbers)))
 
     chosen = {
         "distribution": distribution,

@@ -32,32 +32,34 @@ from numpy.typing import NDArray
 from gonio import jit
 from gonio.brdf import pieces
 from gonio.brdf.elementary import log
-from gonio.brdf.facets import FACETS
+from gonio.brdf.facets import Facets
 from gonio.brdf.pieces import read as read_pieces
 
 Array = NDArray[np.float64]
-_PIECES = 18
 _NEAR = 1e-8  # in alphas: cosines below are near the horizon
 _LOW = 1e-6  # in alphas: slopes below are none
 _PANEL = 1.5  # longest panel in ln tan(theta_h / 2)
 
 
-def lost(at: int) -> Any:
-    """Compiled ``(mu, p) -> 1 - E(mu)`` from the numbers of `derived` that begin at p[at]."""
+def lost(facets: Facets, at: int) -> Any:
+    """Compiled ``(mu, s2, p) -> 1 - E(mu)``, s2 the square sine, from the numbers of `derived` that begin at p[at]."""
+    tip, count = facets.tip, facets.pieces
 
-    def loss(mu, p):  # type: ignore[no-untyped-def]
-        x = log(mu * p[at + 1] + 1.0) * p[at + 2]
-        return read_pieces(x, p, at + 3, _PIECES)
+    def loss(mu, s2, p):  # type: ignore[no-untyped-def]
+        # pieces of ln((mu + near) / (s + tip))
+        x = log((mu * p[at + 1] + 1.0) * (1.0 + tip) / (math.sqrt(s2) + tip)) * p[at + 2]
+        return read_pieces(x, p, at + 3, count)
 
     return jit.model(loss)
 
 
-def derived(distribution: str, shadowing: str, average: float, p: Array, at: int) -> Array:
-    """Weight of the product of losses, two scales of ln mu, and the table of 1 - E.
+def derived(facets: Facets, shadowing: str, average: float, p: Array, at: int) -> Array:
+    """Weight of the product of losses, two scales of the table's argument, and the table of 1 - E.
 
     Parameters
     ----------
-    distribution, shadowing : str
+    facets : Facets
+    shadowing : str
     average : float
         Mean of Fresnel's reflectance.
     p : ndarray
@@ -65,21 +67,41 @@ def derived(distribution: str, shadowing: str, average: float, p: Array, at: int
     at : int
         Index of the latter.
     """
-    near = _NEAR * float(p[1])
-    span = math.log1p(1.0 / near)
-    x = pieces.nodes(_PIECES).ravel() * (span / _PIECES)
-    mu = np.minimum(near * np.expm1(x), 1.0)
+    near, tip, count = _NEAR * float(p[1]), facets.tip, facets.pieces
+    span = math.log((1.0 / near + 1.0) * (1.0 + tip) / tip)
+    mu, s = _angles(pieces.nodes(count).ravel() * (span / count), span, near, tip)
     found = np.empty(len(mu))
-    _losses(distribution, shadowing, at)(mu, p, *rules(FACETS[distribution].pointed), found)
-    table = pieces.table(found.reshape(_PIECES, -1))
-    # 1 - E averaged: 2 mu dmu, mu = near (e^x - 1), of the table
+    _losses(facets.density(at), facets.hidden(at), shadowing == "smith", facets.pointed)(
+        mu, s, p, facets.steep(p), *rules(facets.pointed), found
+    )
+    table = pieces.table(found.reshape(count, -1))
+    # the mean of 1 - E: 2 mu dmu of the table, with dx = dmu / (mu + near) - ds / (s + tip)
     g, w = np.polynomial.legendre.leggauss(24)
-    at_x = (np.arange(_PIECES)[:, None] + 0.5 * (1.0 + g)) * (span / _PIECES)
-    rows = np.polynomial.polynomial.polyval(g, table.reshape(_PIECES, -1).T, tensor=True)
-    loss = float(np.sum(rows * w * near * near * np.expm1(at_x) * np.exp(at_x)) * (span / _PIECES))
-    kept = 1.0 - loss
-    weight = average * average * kept / (1.0 - average * loss) / (math.pi * loss)
-    return np.concatenate(([weight, 1.0 / near, _PIECES / span], table))
+    x = (np.arange(count)[:, None] + 0.5 * (1.0 + g)) * (span / count)
+    mu, s = _angles(x, span, near, tip)
+    rows = np.polynomial.polynomial.polyval(g, table.reshape(count, -1).T)
+    slope = mu * s / (s / (mu + near) + mu / (s + tip))
+    loss = float(np.sum(rows * w * slope) * (span / count))
+    weight = average * average * (1.0 - loss) / (1.0 - average * loss) / (math.pi * loss)
+    return np.concatenate(([weight, 1.0 / near, count / span], table))
+
+
+def _angles(x: Array, span: float, near: float, tip: float) -> tuple[Array, Array]:
+    """Cosine and sine of the direction at which the table's argument is x: the smaller of the two to all its digits."""
+
+    def smaller(w: Array, a: Array, b: Array) -> Array:
+        # c + a = a e^w (sqrt(1 - c^2) + b) / (1 + b) by Newton's method
+        c = np.minimum(a * np.expm1(w), 0.8)
+        for _ in range(30):
+            rest = np.sqrt((1.0 - c) * (1.0 + c))
+            value = c - a * (np.expm1(w) - np.exp(w) * c * c / ((1.0 + rest) * (1.0 + b)))
+            c = np.clip(c - value / (1.0 + a * np.exp(w) * c / (rest * (1.0 + b))), 0.0, 0.8)
+        return c
+
+    low = x < span + math.log(tip * (1.0 + near) / (1.0 + tip))  # theta > 45 degrees, or about so
+    few = smaller(np.where(low, x, span - x), np.where(low, near, tip), np.where(low, tip, near))
+    many = np.sqrt((1.0 - few) * (1.0 + few))
+    return np.where(low, few, many), np.where(low, many, few)
 
 
 def tanh_sinh(step: float = 0.08, reach: float = 3.9) -> Array:
@@ -112,10 +134,7 @@ def rules(pointed: bool) -> tuple[Array, Array, Array]:
 
 
 @functools.cache
-def _losses(distribution: str, shadowing: str, at: int) -> Any:
-    density, hidden = FACETS[distribution].density(at), FACETS[distribution].hidden(at)
-    correlated, pointed = shadowing == "smith", FACETS[distribution].pointed
-
+def _losses(density: Any, hidden: Any, correlated: bool, pointed: bool) -> Any:
     @jit.model
     def share(mu, mu_i, m_r, p):  # type: ignore[no-untyped-def]
         """(G_1 - G_2) (mu + m_r) / mu"""
@@ -134,12 +153,12 @@ def _losses(distribution: str, shadowing: str, at: int) -> Any:
         end = 0.0 if math.cos(2.0 * theta - theta_r) <= 0.0 else end
         return end, last, least
 
-    def losses(mu, p, along_ring, edged, smooth, out):  # type: ignore[no-untyped-def]
+    def losses(mu, sine_r, p, steep, along_ring, edged, smooth, out):  # type: ignore[no-untyped-def]
         low, quarter = math.log(0.5 * _LOW * p[1]), 0.5 * math.pi
+        floor = 1e-60 ** (1.0 / steep)
         edges = np.empty(5)
         for j in range(mu.size):
-            m = mu[j]
-            s = math.sqrt(max((1.0 - m) * (1.0 + m), 0.0))
+            m, s = mu[j], sine_r[j]
             m_r, theta_r, up = hidden(m, s * s, p), math.atan2(s, m), math.atan2(m, s)
             # rings begin to reach the horizon, begin to have facets unseen, are all below the horizon
             edges[0], edges[1], edges[2], edges[3] = 0.5 * up, up, 0.5 * (quarter + theta_r), quarter
@@ -153,12 +172,19 @@ def _losses(distribution: str, shadowing: str, at: int) -> Any:
                 count = int((far_end - begin) / _PANEL) + 1
                 width = (far_end - begin) / count
                 for n in range(count):
-                    rule = edged if (n == 0 and sharp) or (n == count - 1 and far_end < 0.0) else smooth
+                    last_panel = far_end == 0.0 and n == count - 1
+                    closes = pointed if last_panel else n == count - 1
+                    rule = edged if closes or (n == 0 and sharp) else smooth
                     for k in range(rule.shape[1]):
-                        gap = rule[0, k] * width
-                        theta = 2.0 * math.atan(math.exp(begin + n * width + (gap if gap > 0.0 else width + gap)))
-                        st, ct = math.sin(theta), math.cos(theta)
-                        a, b = m * math.cos(2.0 * theta), s * math.sin(2.0 * theta)  # mu_i = a + b cos(phi)
+                        step, weight = rule[0, k], width * rule[1, k]
+                        u = begin + n * width + width * (step if step > 0.0 else 1.0 + step)
+                        if last_panel:  # D grows like cos(theta)^(1 / steep - 1)
+                            z = max(-step if step < 0.0 else 1.0 - step, floor)
+                            u = -width * z**steep
+                            weight *= steep * z ** (steep - 1.0)
+                        theta = 2.0 * math.atan(math.exp(u))
+                        st, ct = 1.0 / math.cosh(u), -math.tanh(u)
+                        a, b = m * (ct - st) * (ct + st), 2.0 * s * st * ct  # mu_i = a + b cos(phi)
                         along, across = m * ct, s * st  # omega_r . h = along + across cos(phi)
                         end, last, least = bounds(theta, theta_r, a, b, along, across)
                         # sin(phi / 2) = sin(end / 2) v, along_ring[0] = 1 - v; the integrand is even in v
@@ -174,7 +200,7 @@ def _losses(distribution: str, shadowing: str, at: int) -> Any:
                         if last > end:
                             seen += along * (last - end) + across * (math.sin(last) - math.sin(end))
                         d_n, d_d = density(st * st, ct, 1.0, p)
-                        total += 2.0 * width * rule[1, k] * st * st * seen * d_n / (d_d * (m + m_r))
+                        total += 2.0 * weight * st * st * seen * d_n / (d_d * (m + m_r))
                 begin, sharp = far_end, True
             out[j] = total
 
