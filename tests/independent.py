@@ -36,6 +36,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tests import independent_lobes
+
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
 HALF_PI = 0.5 * math.pi
@@ -115,6 +117,8 @@ class Surface:
 def _by_angles(term: dict[str, Any], surface: Surface, theta_i: Array, u: Array) -> Array:
     """f_r for incident polar angle theta_i and azimuth u counted from the mirror direction."""
     model = term["model"]
+    if model in independent_lobes.MODELS:
+        return independent_lobes.by_angles(term, surface, theta_i, u)
     si, ci, sr, cr = np.sin(theta_i), np.cos(theta_i), surface.sin_r, surface.cos_r
     if model == "lambertian":
         return np.full(np.broadcast(theta_i, u).shape, term["albedo"] / math.pi)
@@ -144,6 +148,8 @@ def _by_angles(term: dict[str, Any], surface: Surface, theta_i: Array, u: Array)
 def _by_vectors(term: dict[str, Any], surface: Surface, w: Array) -> Array:
     """f_r for unit vectors w (n, 3), viewer's coordinates; the viewer is (0, 0, 1)."""
     model = term["model"]
+    if model in independent_lobes.MODELS:
+        return independent_lobes.by_vectors(term, surface, w)
     mu_i, mu_r = w @ surface.normal, surface.cos_r
     if model == "lambertian":
         return np.full(len(w), term["albedo"] / math.pi)
@@ -383,7 +389,10 @@ def _arrange(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> _A
         found.circles += [(_towards(0.0, 0.0), (i + 0.5) * math.pi / rows, False) for i in range(rows)]
         middles = {round(((j + 0.5) * 2 / columns) % 1.0, 12) for j in range(columns)}  # opposite ones share a plane
         found.circles += [(_towards(HALF_PI, m * math.pi + HALF_PI), HALF_PI, False) for m in sorted(middles)]
-    if term["model"] == "ggx":
+    if term["model"] in independent_lobes.MODELS:
+        found.features += independent_lobes.features(term, surface)
+        found.circles += independent_lobes.circles(term, surface)
+    elif term["model"] == "ggx":
         found.features.append((surface.mirror, term["alpha"]))
     elif term["model"] == "phong":
         found.features.append((surface.mirror, 1 / math.sqrt(max(1.0, term["n"]))))
@@ -398,6 +407,8 @@ def _pole(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> Array
     narrow = [(1 / math.sqrt(part["kappa"]), _axis(part))] if part["kind"] == "lobes" and part["kappa"] > 1 else []
     if part["kind"] == "disk":
         narrow.append((part["half_angle"], _axis(part)))
+    if term["model"] in independent_lobes.MODELS:
+        narrow += [(2 * width, direction) for direction, width in independent_lobes.features(term, surface)]
     if term["model"] == "ggx":
         narrow.append((2 * term["alpha"], surface.mirror))
     if term["model"] == "phong":

@@ -24,7 +24,6 @@ from gonio.brdf.elementary import power
 Array = NDArray[np.float64]
 INV_PI = 1.0 / math.pi
 _LEAST = 1e-300  # of the product of the cosines: f_r stays finite
-_GRADED = np.array([[0.0, 0.0, 1.0, height] for height in (0.03, 1e-3, 3e-5)])
 
 
 @jit.model
@@ -36,10 +35,9 @@ def minnaert_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: floa
     return albedo * INV_PI * power(product, k - 1.0) if lit else 0.0
 
 
-def _kinks(p: Array, omega_r: Array) -> Array:
-    """None, but unless k - 1 is 0 or 1 mu_i^(k - 1) has no derivatives at the horizon: panels grow from there."""
-    rows = np.empty((0, 4)) if p[1] in (1.0, 2.0) else _GRADED
-    return np.broadcast_to(rows, (*omega_r.shape[:-1], len(rows), 4))
+def _features(p: Array, omega_r: Array) -> Array:
+    """The horizon as a whole: mu_i^(k - 1) has no derivatives there, and only cells halved until they agree see it."""
+    return np.empty((0, 4)) if p[1] in (1.0, 2.0) else np.array([[0.0, 0.0, 1.0, 0.5 * math.pi]])
 
 
 MINNAERT = Model(
@@ -51,6 +49,6 @@ MINNAERT = Model(
     function=minnaert_f_r,
     doc="albedo / pi (cos theta_i cos theta_r)^(k - 1); infinite at the horizon for k < 1.",
     reference="Minnaert, Astrophysical Journal 93, 1941",
-    kinks=_kinks,
+    features=_features,
     energy_bounded=False,
 )

@@ -43,7 +43,7 @@ def _rules() -> tuple[Array, Array, NDArray[np.int64]]:
 
 
 def add(
-    term: Term, cap: Cap, gradients: Gradients, crossed: Array, planes: Array, rtol: float, floor: float,
+    term: Term, cap: Cap, gradients: Gradients, crossed: NDArray[np.int64], planes: Array, rtol: float, floor: float,
     value: Array, error: Array,
 ) -> tuple[float, int, NDArray[np.intp]]:  # fmt: skip
     """Add value and error of the gradients `crossed`; the largest relative error, the evaluations, and what is left.

@@ -12,7 +12,10 @@ Panels grow from the features: the lobe, the horizon and its layer of shadowing,
 width w in half-vector angle has its poles, on the ring theta, at :math:`D = \pm 2i\,\mathrm{asinh}\,e`,
 :math:`4e^2\sin\frac\theta2\sin\theta_n = w^2 + 4\sin^2\frac{\theta/2-\theta_n}{2}` (exact for GGX up to the definition of w,
 from :math:`\cos\theta_h = \cos\frac\theta2\cos\theta_n+\sin\frac\theta2\sin\theta_n\cos D`). A Gauss rule of q nodes errs by
-:math:`\rho^{-2q}` with rho of the ellipse through the nearest pole [1]_; q follows from it for every panel.
+:math:`\rho^{-2q}` with rho of the ellipse through the nearest pole [1]_; q follows from it for every panel. On top come
+nodes for the waves, half the degree n at which :math:`J_n(mh)` has died: along a ring those of cos mD, across rings those
+with which K_m turns as the ring's cut at the horizon or a kink moves. Towards rings that are only touched, where there is a
+square root, panels are graded. So d digits asked for are d digits, of the largest value at the slope.
 
 References
 ----------
@@ -35,8 +38,9 @@ Array = NDArray[np.float64]
 LARGEST_ORDER = 96
 _GROWTH = 4.0
 _FIRST = 1.5  # length of the panel next to a feature, in units of the distance of its pole
-_CAPACITY = 4096
-_RING = 8192  # nodes of one ring
+_CAPACITY = 4096  # breakpoints, besides the rows of a map
+_RING = 8192  # nodes of one ring, besides those for the waves
+_GRADE = 4.0  # growth of panels away from where a ring begins to be cut
 
 
 @functools.cache
@@ -86,21 +90,33 @@ def _order(a, b, centre, scale, digits):  # type: ignore[no-untyped-def]
 
 
 @jit.part
-def _theta_panels(points, sn, cn, theta_n, width, layer, planes, breaks, rows):  # type: ignore[no-untyped-def]
-    """Edges of the panels in theta; returns how many."""
+def _tangents(touch, sn, cn, theta_n, planes):  # type: ignore[no-untyped-def]
+    """Rings that the horizon or a plane of kinks touches, where integrals over rings have square roots; how many."""
     upper = min(math.pi, 0.5 * math.pi + theta_n)
-    n = _insert(points, 0, 0.5 * math.pi - theta_n, 0.0, upper)
+    touch[0], touch[1], n = 0.5 * math.pi - theta_n, upper, 2
+    for k in range(planes.shape[0]):
+        if abs(planes[k, 3]) < 1.0:
+            gamma = abs(math.atan2(planes[k, 0] * cn + planes[k, 2] * sn, planes[k, 2] * cn - planes[k, 0] * sn))
+            opening = math.acos(planes[k, 3])
+            for t in (abs(gamma - opening), gamma + opening, 2.0 * math.pi - gamma - opening):
+                if t > 0.0 and t < upper:
+                    touch[n] = t
+                    n += 1
+    return n
+
+
+@jit.part
+def _theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, planes, breaks, rows):  # type: ignore[no-untyped-def]
+    """Edges of the panels in theta; returns how many."""
+    upper = touch[1]
+    n = 0
+    for k in range(touching):
+        n = _insert(points, n, touch[k], 0.0, upper)
     if width < 10.0:
         n = _grow(points, n, 2.0 * theta_n, 2.0 * width, 0.0, upper)
     if layer < 10.0:
         n = _grow(points, n, upper, layer, 0.0, upper)
         n = _grow(points, n, 0.5 * math.pi - theta_n, layer, 0.0, upper)
-    for k in range(planes.shape[0]):
-        gamma = abs(math.atan2(planes[k, 0] * cn + planes[k, 2] * sn, planes[k, 2] * cn - planes[k, 0] * sn))
-        opening = math.acos(min(1.0, max(-1.0, planes[k, 3])))
-        n = _insert(points, n, abs(gamma - opening), 0.0, upper)
-        n = _insert(points, n, gamma + opening, 0.0, upper)
-        n = _insert(points, n, 2.0 * math.pi - gamma - opening, 0.0, upper)
     for k in range(planes.shape[0]):  # rings where two kinks, or a kink and the horizon, meet
         for j in range(-1, k):
             c_x, c_z, d = (0.0, 1.0, 0.0) if j < 0 else (planes[j, 0], planes[j, 2], planes[j, 3])
@@ -116,33 +132,37 @@ def _theta_panels(points, sn, cn, theta_n, width, layer, planes, breaks, rows): 
         for k in range(n, 0, -1):
             points[k] = points[k - 1]
         points[0], points[n + 1] = 0.0, upper
-        return n + 2
-    # else panels no longer than those of the field, which need not meet its edges
-    coarse = np.empty(n + 2)
-    coarse[0], coarse[n + 1] = 0.0, upper
-    coarse[1 : n + 1] = points[:n]
-    count = 0
-    for k in range(n + 1):
-        a, b = coarse[k], coarse[k + 1]
-        pieces = max(1, math.ceil(_field_panels(breaks, b) - _field_panels(breaks, a) - 1e-9))
-        for j in range(pieces):
-            if count < points.size - 1:
-                points[count] = a + (b - a) * j / pieces
-                count += 1
-    points[count] = upper
-    return count + 1
-
-
-@jit.part
-def _touches(planes, a, b, sn, cn):  # type: ignore[no-untyped-def]
-    """Whether a plane of kinks touches one of the two rings."""
-    for k in range(planes.shape[0]):
-        gamma = abs(math.atan2(planes[k, 0] * cn + planes[k, 2] * sn, planes[k, 2] * cn - planes[k, 0] * sn))
-        opening = math.acos(min(1.0, max(-1.0, planes[k, 3])))
-        for t in (abs(gamma - opening), gamma + opening, 2.0 * math.pi - gamma - opening):
-            if abs(a - t) < 1e-12 or abs(b - t) < 1e-12:
-                return True
-    return False
+        n += 2
+    else:  # panels no longer than those of the field, which need not meet its edges
+        coarse = np.empty(n + 2)
+        coarse[0], coarse[n + 1] = 0.0, upper
+        coarse[1 : n + 1] = points[:n]
+        last, n = n + 1, 0
+        for k in range(last):
+            a, b = coarse[k], coarse[k + 1]
+            pieces = max(1, math.ceil(_field_panels(breaks, b) - _field_panels(breaks, a) - 1e-9))
+            for j in range(pieces):
+                if n < points.size - 1:
+                    points[n] = a + (b - a) * j / pieces
+                    n += 1
+        points[n] = upper
+        n += 1
+    for k in range(touching):  # a square root just outside a long panel: grade that panel towards it
+        for side in (-1.0, 1.0):
+            i = np.searchsorted(points[:n], touch[k] + side * 1e-12)
+            i = i - 1 if side < 0.0 else i
+            if i < 0 or i >= n:
+                continue
+            step = _GRADE * abs(points[i] - touch[k])
+            while step > 0.0 and step < math.pi:
+                t = touch[k] + side * step
+                if t > 0.0 and t < upper:
+                    j = np.searchsorted(points[:n], t)
+                    near = points[j - 1] if side > 0.0 else points[j]
+                    if points[j] - points[j - 1] > (_GRADE - 1.0) * 1.5 * abs(near - touch[k]):
+                        n = _insert(points, n, t, 0.0, upper)
+                step *= _GRADE
+    return n
 
 
 @jit.part
@@ -150,6 +170,45 @@ def _field_panels(breaks, t):  # type: ignore[no-untyped-def]
     """How many panels of the field there are up to t, a real number."""
     k = min(max(np.searchsorted(breaks, t, side="right") - 1, 0), breaks.size - 2)
     return k + (t - breaks[k]) / (breaks[k + 1] - breaks[k])
+
+
+@jit.part
+def _wave_order(waves, length, digits):  # type: ignore[no-untyped-def]
+    """Nodes that waves up to cos(m D) take on an interval: half the degree at which their series, Bessel's J_n, has died."""
+    z = 0.5 * waves * length
+    return 0.5 * z + 0.5 * (digits * digits * z) ** (1.0 / 3.0)
+
+
+@jit.part
+def _reach(st, ct, sn, cn):  # type: ignore[no-untyped-def]
+    """Half of the part of a ring above the horizon [rad], and whether the horizon cuts it."""
+    # zi = cos t cn + sin t sn cos D; it vanishes where tan^2(D/2) = cos(t - theta_n) / -cos(t + theta_n)
+    far = ct * cn - st * sn
+    if far >= 0.0:
+        return math.pi, False
+    near = ct * cn + st * sn
+    if near <= 0.0:
+        return 0.0, True
+    return 2.0 * math.atan2(math.sqrt(near), math.sqrt(-far)), True
+
+
+@jit.part
+def _crossing(plane, st, ct, sn, cn):  # type: ignore[no-untyped-def]
+    """Where on a half ring it meets a plane of kinks [rad]; 0 or pi if it does not."""
+    c_z = plane[2] * cn - plane[0] * sn
+    c_x = plane[0] * cn + plane[2] * sn
+    return math.acos(min(1.0, max(-1.0, (plane[3] - c_z * ct) / max(1e-300, abs(c_x * st)))))
+
+
+@jit.part
+def _turn(a, b, sn, cn, planes):  # type: ignore[no-untyped-def]
+    """By how much the horizon and the kinks move along the rings between a and b, at most [rad]."""
+    sa, ca, sb, cb = math.sin(a), math.cos(a), math.sin(b), math.cos(b)
+    turn = abs(_reach(sb, cb, sn, cn)[0] - _reach(sa, ca, sn, cn)[0])
+    for k in range(planes.shape[0]):
+        if abs(planes[k, 3]) < 1.0:
+            turn = max(turn, abs(_crossing(planes[k], sb, cb, sn, cn) - _crossing(planes[k], sa, ca, sn, cn)))
+    return turn
 
 
 @jit.part
@@ -170,16 +229,11 @@ def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: igno
 
 
 @jit.part
-def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, per_radian, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
+def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, waves, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
     """Nodes in D on the half ring from 0 to the horizon, weights times `scale`; returns how many."""
-    reach, clipped = math.pi, False
-    # zi = cos t cn + sin t sn cos D; it vanishes where tan^2(D/2) = cos(t - theta_n) / -cos(t + theta_n)
-    far = ct * cn - st * sn
-    if far < 0.0:
-        near = ct * cn + st * sn
-        if near <= 0.0:
-            return 0
-        reach, clipped = 2.0 * math.atan2(math.sqrt(near), math.sqrt(-far)), True
+    reach, clipped = _reach(st, ct, sn, cn)
+    if reach == 0.0:
+        return 0
     pole, edge = 1e9, 1e9
     n = 0
     product = st * sn
@@ -187,12 +241,13 @@ def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, per_ra
         squared = (width * width + 4.0 * math.sin(0.25 * t - 0.5 * theta_n) ** 2) / max(4.0 * math.sin(0.5 * t) * sn, 1e-300)
         pole = max(2.0 * math.asinh(math.sqrt(squared)), 1e-10)
         n = _grow(points, n, 0.0, pole, 0.0, reach)
-    if layer < 10.0 and clipped:
+    if layer < 10.0:  # at the horizon, or where the ring comes nearest to it
+        edge = math.sqrt(2.0 * (layer + max(0.0, ct * cn - product)) / max(product, 1e-300))
         slope = product * math.sin(reach)
-        edge = math.sqrt(2.0 * layer / max(product, 1e-300))
-        if slope * edge > layer:
+        if clipped and slope * edge > layer:
             edge = layer / slope
-        n = _grow(points, n, reach, edge, 0.0, reach)
+        if edge < math.pi:
+            n = _grow(points, n, reach, edge, 0.0, reach)
     for k in range(planes.shape[0]):
         c_z = planes[k, 2] * cn - planes[k, 0] * sn
         c_x = planes[k, 0] * cn + planes[k, 2] * sn
@@ -203,7 +258,7 @@ def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, per_ra
     for k in range(n + 1):
         b = points[k] if k < n else reach
         order = max(_order(a, b, 0.0, pole, digits), _order(a, b, reach, edge, digits))
-        order = max(order, 0.15 * digits * (b - a)) + per_radian * (b - a) + 1.0
+        order = max(order, 0.15 * digits * (b - a)) + _wave_order(waves, b - a, digits) + 1.0
         count = _arc(x_table, w_table, a, b, order, scale, nodes, weights, count)
         a = b
     return count
@@ -211,62 +266,69 @@ def _ring_nodes(points, t, st, ct, sn, cn, theta_n, width, layer, planes, per_ra
 
 @functools.cache
 def ring_kernel(function: Callable[..., float]) -> Any:
-    """Compiled ``kernel(slopes, p, weight, width, layers, planes, breaks, series, used, rows, digits, x, w, out, n)``.
+    """Compiled kernel of ``(slopes, p, weight, width, layers, planes, breaks, series, used, bent, error, rows, digits, x, w,
+    out, n)``.
 
-    ``slopes`` (k, 2): cos and sin of theta_n; ``layers`` (k,), ``planes`` (k, j, 4); ``out`` (k, 3, waves) receives A_m, B_m
-    and the integral of abs(K_m) sin theta, whose first is the directional albedo; ``n`` (1,) evaluations.
+    ``slopes`` (k, 2): cos and sin of theta_n; ``layers`` (k,), ``planes`` (k, j, 4); ``used`` and ``bent`` (panels,): waves
+    to sum, and waves whose integrals over rings turn with the horizon by more than is negligible; ``error`` (panels,) of the
+    series. ``out`` (k, 3, waves) receives A_m, B_m and, first in its last row, the directional albedo and the error of R due
+    to that of the series; ``n`` (1,) evaluations.
     """
 
-    def ring_sums(slopes, p, weight, width, layers, planes, breaks, series, used, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
-        points, arcs = np.empty(_CAPACITY), np.empty(_CAPACITY)
-        nodes, weights = np.empty(_RING), np.empty(_RING)
-        cosine, kernel = np.empty(_RING), np.empty(_RING)
-        c0, c1 = np.empty(_RING), np.empty(_RING)
+    def ring_sums(slopes, p, weight, width, layers, planes, breaks, series, used, bent, error, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
         most = out.shape[2]
+        points, arcs = np.empty(_CAPACITY + 2 * breaks.size), np.empty(_CAPACITY)
+        touch = np.empty(2 + 3 * planes.shape[1])
+        room = _RING + 2 * most
+        nodes, weights = np.empty(room), np.empty(room)
+        cosine, kernel = np.empty(room), np.empty(room)
+        c0, c1 = np.empty(room), np.empty(room)
         wave, cheb = np.empty(most + 4), np.empty(series.shape[1])
         degree = series.shape[1] - 1
         for slope in range(slopes.shape[0]):
             cn, sn = slopes[slope, 0], slopes[slope, 1]
             theta_n = math.atan2(sn, cn)
             layer = layers[slope]
-            tangent = 0.5 * math.pi - theta_n
             total = out[slope]
             total[:] = 0.0
-            edges = _theta_panels(points, sn, cn, theta_n, width, layer, planes[slope], breaks, rows)
-            upper = points[edges - 1]
+            touching = _tangents(touch, sn, cn, theta_n, planes[slope])
+            edges = _theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, planes[slope], breaks, rows)
             for panel in range(edges - 1):
                 a, b = points[panel], points[panel + 1]
-                touching = abs(a - tangent) < 1e-12 or abs(b - tangent) < 1e-12 or abs(b - upper) < 1e-12
-                touching = touching or _touches(planes[slope], a, b, sn, cn)
                 order = 0.15 * digits * (b - a)
                 if width < 10.0:
                     order = max(order, _order(a, b, 2.0 * theta_n, 2.0 * width, digits))
                 if layer < 10.0:
-                    order = max(order, _order(a, b, upper, layer, digits), _order(a, b, tangent, layer, digits))
+                    order = max(order, _order(a, b, touch[1], layer, digits), _order(a, b, touch[0], layer, digits))
                 if rows:
                     order += 0.5 + 0.5 * degree + 0.1 * digits
                 else:
                     order += 1.3 + 0.2 * digits * (_field_panels(breaks, b) - _field_panels(breaks, a))
-                if not touching:  # near, but not at, where a ring begins to be cut
-                    order = max(order, _order(a, b, tangent, 0.0, digits - 3.0))
-                    order = max(order, _order(a, b, upper, 0.0, digits - 3.0))
-                if touching:
+                at = False
+                for k in range(touching):
+                    at = at or abs(a - touch[k]) < 1e-12 or abs(b - touch[k]) < 1e-12
+                for k in range(touching):
+                    if not at:
+                        order = max(order, _order(a, b, touch[k], 0.0, digits - 3.0))
+                k = min(max(np.searchsorted(breaks, 0.5 * (a + b), side="right") - 1, 0), breaks.size - 2)
+                turn = _turn(a, b, sn, cn, planes[slope])
+                order += _wave_order(min(bent[k], most), turn, 0.3 * digits)  # the last of these waves are weak
+                if at:
                     order = 2.0 * order + 3.0
-                q = min(LARGEST_ORDER, max(2, math.ceil(order)))
+                pieces = max(1, math.ceil(order / LARGEST_ORDER))
+                q = min(LARGEST_ORDER, max(2, math.ceil(order / pieces)))
                 start = q * (q - 1) // 2
-                for i in range(q):
-                    x, w = x_table[start + i], w_table[start + i]
-                    if touching:  # (t - tangent)^(3/2) there, which this makes smooth
+                for i in range(q * pieces):
+                    x, w = (i // q + x_table[start + i % q]) / pieces, w_table[start + i % q] / pieces
+                    if at:  # (t - tangent)^(3/2) there, which this makes smooth
                         t, dt = a + (b - a) * x * x * (3.0 - 2.0 * x), (b - a) * 6.0 * x * (1.0 - x) * w
                     else:
                         t, dt = a + (b - a) * x, (b - a) * w
                     st, ct = math.sin(t), math.cos(t)
                     k = min(max(np.searchsorted(breaks, t, side="right") - 1, 0), breaks.size - 2)
                     waves = min(used[k], most)
-                    # cos(m D) on [a, b] takes m (b - a) / 4 nodes; fields without kinks have little in their last waves
-                    per_radian = (0.27 if rows else 0.15) * (waves - 1)
                     n = _ring_nodes(
-                        arcs, t, st, ct, sn, cn, theta_n, width, layer, planes[slope], per_radian, digits,
+                        arcs, t, st, ct, sn, cn, theta_n, width, layer, planes[slope], waves - 1, digits,
                         2.0 * st * dt * weight, x_table, w_table, nodes, weights,
                     )  # fmt: skip
                     effort[0] += n
@@ -309,8 +371,8 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                             c0[j] = u2
                             c1[j] = u3
                         wave[m], wave[m + 1], wave[m + 2], wave[m + 3] = s0, s1, s2, s3
-                    for m in range(waves):
-                        total[2, m] += abs(wave[m])
+                    total[2, 0] += abs(wave[0])
+                    total[2, 1] += error[k] * abs(wave[0])
                     u = (2.0 * t - breaks[k] - breaks[k + 1]) / (breaks[k + 1] - breaks[k])
                     cheb[0] = 1.0
                     if degree > 0:

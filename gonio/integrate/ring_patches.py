@@ -65,6 +65,8 @@ class Table:
     first : ndarray of int, shape (256,)
         Piece at the lower end of each 256th of [0, 1].
     coefficients : ndarray
+    least : float
+        No value is below it, and none is reported: 0 for fields that are nowhere negative.
     """
 
     bounds: Array
@@ -72,9 +74,10 @@ class Table:
     shapes: Index
     first: Index
     coefficients: Array
+    least: float
 
     @classmethod
-    def of(cls, bounds: Array, errors: Array, pieces: Sequence[Patches]) -> Table:
+    def of(cls, bounds: Array, errors: Array, pieces: Sequence[Patches], least: float = -math.inf) -> Table:
         """From pieces in rising order."""
         shapes, start = [], 0
         for piece in pieces:
@@ -83,7 +86,7 @@ class Table:
             start += piece.coefficients.size
         first = np.clip(np.searchsorted(bounds, np.arange(_LOOKUP) / _LOOKUP, side="right") - 1, 0, len(pieces) - 1)
         flat = np.concatenate([piece.coefficients.ravel() for piece in pieces])
-        return cls(bounds, errors, np.array(shapes), first.astype(np.int64), flat)
+        return cls(bounds, errors, np.array(shapes), first.astype(np.int64), flat, least)
 
     @property
     def largest(self) -> float:
@@ -119,7 +122,7 @@ class Table:
         missed = np.empty(tile[1] - tile[0], dtype=np.int64)
         worst, count = _add(
             gradients.p, gradients.q, *tile, self.bounds, self.errors, self.shapes, self.first, self.coefficients,
-            rtol, atol, negligible, value, error, missed,
+            self.least, rtol, atol, negligible, value, error, missed,
         )  # fmt: skip
         return float(worst), missed[:count].astype(np.intp)
 
@@ -260,7 +263,7 @@ def _survey_tile(p, q, start, stop, rtol, atol, value, error, bins):  # type: ig
     return _tau(math.sqrt(low.min()), 0.0), _tau(math.sqrt(high.max()), 0.0), largest
 
 
-def _read_tile(p, q, start, stop, bounds, errors, shapes, first, table, rtol, atol, negligible, value, error, missed):  # type: ignore[no-untyped-def]
+def _read_tile(p, q, start, stop, bounds, errors, shapes, first, table, least, rtol, atol, negligible, value, error, missed):  # type: ignore[no-untyped-def]
     columns, last = p.shape[1], errors.size - 1
     along, across, tau, phi = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     weights, sums, total = np.empty((8, _BLOCK)), np.empty(8), np.empty(_BLOCK)
@@ -329,6 +332,9 @@ def _read_tile(p, q, start, stop, bounds, errors, shapes, first, table, rtol, at
             )
         for m in range(n):
             e = errors[which[m]]
+            if total[m] < least:
+                e = max(e, least - total[m])
+                total[m] = least
             late = e > max(rtol * abs(total[m]), max(atol, 0.5 * (rtol * abs(value[k + m]) - error[k + m])))
             value[k + m] += total[m]
             error[k + m] += e

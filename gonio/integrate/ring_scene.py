@@ -33,6 +33,12 @@ class Scene:
     threads: int
     effort: Effort
     first_waves: int  # to begin with
+    overshoots: bool = False  # the field, below 0
+
+    @property
+    def least(self) -> float:
+        """What no value can be below: smooth maps overshoot."""
+        return -math.inf if self.overshoots else 0.0
 
     def sums(self, tau: Array, digits: float, waves: int) -> Array:
         """A_m, B_m and the size of K_m for slopes tan(theta_n / 2), shape (n, 3, waves)."""
@@ -42,12 +48,13 @@ class Scene:
         out = np.zeros((len(tau), 3, waves))
         x, w = gauss_table()
         kernel: Any = ring_kernel(self.term.model.function)
+        used, bent, error = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1)
 
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
                 slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], planes[tile], self.rings.breaks,
-                self.rings.series, self.rings.used, self.rows, digits * math.log(10.0), x, w, out[tile], effort,
+                self.rings.series, used, bent, error, self.rows, digits * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
 
@@ -75,7 +82,8 @@ class Scene:
 
 
 def first_digits(rtol: float) -> float:
-    return min(MOST_DIGITS - 3.0, max(2.0, -1.0 - math.log10(rtol)))
+    """Digits to begin with, of the largest value at a slope: one more than asked for, as most azimuths are darker."""
+    return min(MOST_DIGITS, max(2.0, 0.5 - math.log10(rtol)))
 
 
 def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:
@@ -89,11 +97,19 @@ def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:
 
 
 def tail_of(sums: Array, rings: Spectrum) -> Array:
-    """What waves beyond the last may add, shape (n,): 0 if there are none, else thrice the norm of the last quarter."""
+    """What waves beyond the last may add at any azimuth, shape (n,).
+
+    The field's own waves, all of them known, times how much of the last ones came through: the share that a BRDF lets
+    through falls with m. Of two groups of last waves the larger share is taken twice.
+    """
     waves = sums.shape[2]
     if rings.beyond[waves] == 0.0:
         return np.zeros(len(sums))
-    tail: Array = 3.0 * np.sqrt(np.sum(sums[:, :2, 3 * waves // 4 :] ** 2, axis=(1, 2)))
+    share = np.zeros(len(sums))
+    for first, last in ((3 * waves // 4, 7 * waves // 8), (7 * waves // 8, waves)):
+        given = max(rings.beyond[first] - rings.beyond[last], 1e-3 * rings.beyond[waves], 1e-300)
+        share = np.maximum(share, truncated(sums[..., :last], first) / given)
+    tail: Array = np.minimum(2.0 * share, sums[:, 2, 0]) * rings.beyond[waves]
     return tail
 
 
@@ -110,4 +126,4 @@ def truncated(sums: Array, waves: int) -> Array:
 def floor_of(scene: Scene, sums: Array) -> float:
     """Error of the field's series and rounding."""
     rounding = 4.0 * EPS * (1.0 + 1.0 / scene.width) * float(np.sum(np.abs(sums[:2])))
-    return scene.rings.error * float(sums[2, 0]) + rounding
+    return float(sums[2, 1]) + rounding

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gonio.integrate.results import ROUNDING
 from gonio.integrate.ring_patches import Room, Table, patches
 from gonio.integrate.ring_scene import MOST_DIGITS, Scene, first_digits, floor_of, on_azimuths, tail_of, truncated
 
@@ -43,6 +44,8 @@ class _Piece:
     digits: float
     waves: int
     depth: int = 0
+    halved: int = 0
+    error: float = math.inf  # of the trial before
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
     highest = max(room.highest, lowest * (1.0 + 1e-12) + 1e-300)
     digits = first_digits(rtol)
     waves, scale = _waves(scene, lowest, highest, digits, rtol, room)
+    scale = max(scale, room.largest)
     count = max(1, math.ceil((highest - lowest) * min(waves, 64) / 9.0))
     edges = np.linspace(lowest, highest, count + 1)
     pending = [_Piece(float(a), float(b), digits, waves) for a, b in itertools.pairwise(edges)]
@@ -85,27 +89,33 @@ def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
         first = pending[0]
         batch = [p for p in pending if p.digits == first.digits and p.waves == first.waves]
         pending = [p for p in pending if not (p.digits == first.digits and p.waves == first.waves)]
-        for piece, trial in zip(batch, _try(scene, batch, rtol, room, 2e-14 * scale), strict=True):
+        for piece, trial in zip(batch, _try(scene, batch, rtol, room, 0.5 * ROUNDING * scale), strict=True):
             exhausted = piece.depth >= _DEEPEST or len(done) + len(pending) > _MOST_PIECES
+            # what halving gained once it gains again: at that rate, how many pieces would it take?
+            rate = min(1.0, trial.error / piece.error) if piece.halved else 0.0
+            halvings = math.log(trial.error / trial.allowed) / -math.log(rate) if 0.0 < rate < 0.95 else math.inf * rate
+            exhausted = exhausted or (trial.too_long and piece.halved > 1 and 2.0 ** min(halvings, 99.0) > _MOST_PIECES)
             if trial.good or exhausted:
                 done.append((piece, trial))
                 continue
             better = replace(
                 piece,
-                digits=min(MOST_DIGITS - 3.0, piece.digits + math.ceil(trial.digits_short)),
+                digits=min(MOST_DIGITS, piece.digits + math.ceil(trial.digits_short)),
                 waves=min(scene.rings.waves, math.ceil(1.5 * piece.waves)) if trial.waves_short else piece.waves,
                 depth=piece.depth + 1,
+                error=trial.error,
             )
             if trial.too_long or (better.digits == piece.digits and better.waves == piece.waves):
                 middle = 0.5 * (piece.lower + piece.upper)
-                pending += [replace(better, upper=middle), replace(better, lower=middle)]
+                half = replace(better, halved=piece.halved + 1)
+                pending += [replace(half, upper=middle), replace(half, lower=middle)]
             else:
                 pending.append(better)
     done.sort(key=lambda item: item[0].lower)
     bounds = np.array([piece.lower for piece, _ in done] + [highest])
     read = [patches(trial.series, _PATCHING * max(trial.allowed, trial.error)) for _, trial in done]
     errors = np.array([trial.error + patch.error for (_, trial), patch in zip(done, read, strict=True)])
-    return Table.of(bounds, errors, read)
+    return Table.of(bounds, errors, read, scene.least)
 
 
 def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution: float) -> list[_Trial]:
@@ -114,37 +124,34 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
     nodes, probes, matrix = _chebyshev()
     at_nodes = np.array([_within(piece, nodes) for piece in pieces])
     at_probes = np.array([_within(piece, probes) for piece in pieces])
-    # nodes with more digits than probes ask for: how many are needed varies with the slope
-    all_nodal = scene.sums(at_nodes.ravel(), digits + 2.0, waves).reshape(len(pieces), len(nodes), 3, waves)
+    all_nodal = scene.sums(at_nodes.ravel(), digits, waves).reshape(len(pieces), len(nodes), 3, waves)
     more = min(scene.rings.waves, max(waves + max(8, waves // 3), scene.first_waves if scene.rows else 0))
-    all_fine = scene.sums(at_probes.ravel(), digits + 3.0, more).reshape(len(pieces), len(probes), 3, more)
-    all_rough = scene.sums(at_probes.ravel(), digits, waves).reshape(len(pieces), len(probes), 3, waves)
+    all_fine = scene.sums(at_probes.ravel(), digits + 1.0, more).reshape(len(pieces), len(probes), 3, more)
     between = np.polynomial.chebyshev.chebvander(probes, _DEGREE)
     columns = 1 << max(5, math.ceil(math.log2(8 * waves)))
     trials = []
     for k, piece in enumerate(pieces):
-        nodal, fine, rough = all_nodal[k], all_fine[k], all_rough[k]
+        nodal, fine = all_nodal[k], all_fine[k]
         exact = on_azimuths(fine, columns, 0.5)
         series = np.tensordot(matrix, nodal[:, :2], axes=1)
         missed = float(np.max(np.abs(on_azimuths(np.tensordot(between, series, axes=1), columns, 0.5) - exact)))
         if scene.rows:  # the series converges slowly where the horizon or the lobe crosses rows: doubt more than the probes
             missed = max(missed, 0.5 * float(np.max(np.sum(np.abs(on_azimuths(series[-3:], columns)), axis=0))))
         lost, tail = float(np.max(truncated(fine, waves))), float(np.max(tail_of(fine, scene.rings)))
-        common = fine[..., :waves] - rough
-        quadrature = float(np.max(np.abs(on_azimuths(common, columns))))
         floor = max(floor_of(scene, sums) for sums in fine)
-        error = _SAFETY * missed + 0.1 * quadrature + floor + tail
+        error = _SAFETY * missed + floor + tail
         smallest = min(float(np.abs(exact).min()), float(np.abs(on_azimuths(nodal, columns)).min()))
-        allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), 2.0 * floor, resolution)
+        allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), 5.0 * floor, resolution)
+        noise = 10.0**-digits * float(np.abs(exact).max())
         trials.append(
             _Trial(
                 series,
                 error,
                 allowed,
                 error <= (1.0 - _PATCHING) * allowed,
-                math.log10(max(quadrature / allowed, 1e-300)) if missed > quadrature else 2.0,
+                math.log10(max(0.3 * noise / allowed, 1.0)),
                 lost + tail > 0.2 * allowed and waves < scene.rings.waves,
-                missed > quadrature + 2.0 * lost,
+                missed > max(noise, 2.0 * lost),
             )
         )
     return trials
@@ -160,7 +167,7 @@ def _waves(scene: Scene, lowest: float, highest: float, digits: float, rtol: flo
     spare = np.array([room.smallest(t, t) for t in at])
     waves = min(scene.rings.waves, scene.first_waves)
     while True:
-        sums = scene.sums(at, digits + 2.0, waves)
+        sums = scene.sums(at, digits, waves)
         values = np.abs(on_azimuths(sums, 4 * waves))
         wanted = 0.1 * np.maximum(np.maximum(rtol * values.min(axis=1), spare), 1e-14 * values.max())
         if waves >= scene.rings.waves or np.all(tail_of(sums, scene.rings) <= wanted):

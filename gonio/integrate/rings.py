@@ -5,7 +5,8 @@ slopes are tabulated (`ring_table`), piecewise by Chebyshev polynomials of tau =
 gradient and regular to 90 degrees, and read by `ring_patches`: the cost of a gradient does not depend on BRDF and field.
 
 The error of a piece is that of the table at slopes and azimuths between its nodes, against sums with more digits and more
-waves, times a safety factor; plus that of the field's own series, and rounding.
+waves, times a safety factor; plus what waves left out may add, the error of the field's own series, and rounding. No value
+is below 0 where the field is not: where the error allows one, it is raised to 0.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from gonio.integrate import threads
 from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients
 from gonio.integrate.quadrature import Effort
-from gonio.integrate.ring_scene import FIRST_WAVES, MOST_DIGITS, NONE, Scene, first_digits, floor_of, tail_of
+from gonio.integrate.ring_scene import FIRST_WAVES, MOST_DIGITS, NONE, Scene, first_digits, floor_of, on_azimuths, tail_of
 from gonio.integrate.spectrum import spectrum
 
 Array = NDArray[np.float64]
+_STEP = 1.5  # digits from one sum to the next
+_SHARE = 0.4  # of the difference of two sums that may be left in the finer one, which should be a thirtieth
 FEW = 96  # distinct slopes up to which each is summed by itself
 
 
@@ -38,6 +41,7 @@ def scene_of(term: Term, field: Field, rtol: float, effort: Effort, cores: int |
         effort,
         # of a map beyond the first copy of its spectrum, as what its kinks add starts there
         max(FIRST_WAVES, min(400, 3 * columns // 2)),
+        isinstance(field, EnvironmentMap) and field.interpolation == "smooth",
     )
 
 
@@ -69,7 +73,8 @@ def integrate_rings(scene: Scene, elements: Elements, *, rtol: float, atol: floa
     tau = elements.sin_theta / (1.0 + elements.cos_theta)
     phi = np.arctan2(elements.sin_phi, elements.cos_phi)
     slopes, where = np.unique(tau, return_inverse=True)
-    return _directly(scene, slopes, where, phi, rtol, np.broadcast_to(np.asarray(atol, dtype=float), tau.shape))
+    value, error = _directly(scene, slopes, where, phi, rtol, np.broadcast_to(np.asarray(atol, dtype=float), tau.shape))
+    return np.maximum(value, scene.least), np.maximum(error, scene.least - value)
 
 
 def _series(sums: Array, phi: Array) -> Array:
@@ -86,30 +91,27 @@ def _directly(
 ) -> tuple[Array, Array]:
     """Each slope by itself, with more digits and more waves until the tolerance is met."""
     value, error = np.zeros(len(phi)), np.full(len(phi), np.inf)
-    digits = max(4.0, first_digits(rtol))
+    digits = max(2.0, first_digits(rtol) - 2.0)
     waves = min(scene.rings.waves, scene.first_waves)
     pending = np.arange(len(slopes))
     rough = scene.sums(slopes, digits, waves)
     while True:
-        digits += 3.0
-        fine = scene.sums(slopes[pending], digits, waves)
-        tail = tail_of(fine, scene.rings)
+        fine = scene.sums(slopes[pending], digits + _STEP, waves)
+        tail, columns = tail_of(fine, scene.rings), 4 * waves
+        step = np.abs(on_azimuths(fine - rough, columns)).max(axis=1)
+        again = np.zeros(len(pending), dtype=np.bool_)
         for j, k in enumerate(pending):
             here = np.flatnonzero(where == k)
-            exact = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
-            before = _series(np.broadcast_to(rough[j], (len(here), *rough[j].shape)), phi[here])
-            value[here] = exact
-            error[here] = 4.0 * np.abs(exact - before) + tail[j] + floor_of(scene, fine[j])
-        missed = error > np.maximum(rtol * np.abs(value), atol)
-        again = np.isin(pending, where[missed])
-        more_waves = bool(np.any(tail > 0.0)) and waves < scene.rings.waves
-        if not np.any(again) or (digits >= MOST_DIGITS and not more_waves):
+            value[here] = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
+            error[here] = _SHARE * step[j] + tail[j] + floor_of(scene, fine[j])
+            again[j] = np.any(error[here] > np.maximum(rtol * np.abs(value[here]), atol[here]))
+        if not np.any(again):
             return value, error
-        pending, tail_limited = pending[again], tail[again] > 0.3 * np.abs(fine[again, 0, 0]) * rtol
-        rough = fine[again]
-        if np.any(tail_limited) and waves < scene.rings.waves:
+        pending, few_waves = pending[again], np.any(tail[again] > _SHARE * step[again]) and waves < scene.rings.waves
+        if few_waves:
             waves = min(scene.rings.waves, 2 * waves)
-            digits -= 3.0
             rough = scene.sums(slopes[pending], digits, waves)
-        elif digits >= MOST_DIGITS:
+        elif digits < MOST_DIGITS - _STEP:
+            digits, rough = digits + _STEP, fine[again]
+        else:
             return value, error

@@ -44,27 +44,35 @@ class Spectrum:
         Edges of the panels, 0 to pi [rad].
     series : ndarray, shape (p, degree + 1, 2, waves)
         Chebyshev coefficients of a_m and b_m on each panel.
-    used : ndarray of int, shape (p,)
-        How many waves are not negligible on a panel.
-    error : float
-        Largest error of the radiance, truncation apart for maps [W m^-2 sr^-1].
+    size : ndarray, shape (p, waves)
+        Bound of each wave on each panel [W m^-2 sr^-1].
+    error : ndarray, shape (p,)
+        Largest error of the radiance on a panel, truncation apart for maps [W m^-2 sr^-1].
     beyond : ndarray, shape (waves + 1,)
         Bound of the sum of all waves from m on, at any theta, also those that are not kept [W m^-2 sr^-1].
-    scale : float
-        Largest radiance.
     """
 
     breaks: Array
     series: Array
-    used: NDArray[np.int64]
-    error: float
+    size: Array
+    error: Array
     beyond: Array
-    scale: float
 
     @property
     def waves(self) -> int:
         """Number of terms of the Fourier series, m = 0 to waves - 1."""
         return int(self.series.shape[3])
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019 - spectra are few, and kept by `spectrum` anyway
+    def needed(self, digits: float, power: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """For each panel: how many waves matter, how many of them divided by m^power, and the error with the former."""
+        negligible = 0.1 * 10.0**-digits * self.size.sum(axis=1)
+        remaining = np.cumsum(self.size[:, ::-1], axis=1)[:, ::-1]
+        used = np.maximum(1, (remaining > negligible[:, None]).sum(axis=1))
+        cut = np.where(used < self.waves, remaining[np.arange(len(used)), np.minimum(used, self.waves - 1)], 0.0)
+        weak = self.size / np.maximum(1.0, np.arange(self.waves)) ** power
+        bent = (np.cumsum(weak[:, ::-1], axis=1)[:, ::-1] > 30.0 * negligible[:, None]).sum(axis=1)
+        return used.astype(np.int64), bent.astype(np.int64), self.error + cut
 
 
 @functools.lru_cache(maxsize=16)
@@ -119,22 +127,15 @@ def _of_map(field: EnvironmentMap, tolerance: float) -> Spectrum:
         series = np.array(pieces)
     size = np.hypot(*np.moveaxis(np.abs(series).sum(axis=1), 1, 0))  # (panels, waves)
     scale = field.radiance
-    used = _count_used(size, 0.01 * tolerance * scale)
+    error = 8 * EPS * np.maximum(size.sum(axis=1), scale)
     # what is not kept falls as 1/m^2 (smooth: 1/m^4), period by period of the columns
     rest = 1.1 * waves * float(np.mean(size.max(axis=0)[-n_phi:]))
-    return Spectrum(breaks, np.ascontiguousarray(series), used, 8 * EPS * scale, _beyond(size, rest), scale)
+    return Spectrum(breaks, np.ascontiguousarray(series), size, error, _beyond(size, rest))
 
 
 def _beyond(size: Array, rest: float) -> Array:
     """Sums of the largest waves from m on, and `rest`."""
     return np.concatenate((np.cumsum(size.max(axis=0)[::-1])[::-1], [0.0])) + rest
-
-
-def _count_used(size: Array, negligible: float) -> NDArray[np.int64]:
-    """Waves up to which the sum of what follows exceeds `negligible`; at least one."""
-    remaining = np.cumsum(size[:, ::-1], axis=1)[:, ::-1]
-    used: NDArray[np.int64] = np.maximum(1, (remaining > negligible).sum(axis=1)).astype(np.int64)
-    return used
 
 
 def _first_breaks(field: Field) -> list[float]:
@@ -195,11 +196,10 @@ def _of_samples(field: Field, tolerance: float) -> Spectrum:
     table[..., 1:] *= 2.0
     negligible = 0.1 * tolerance * scale
     size = np.hypot(*np.moveaxis(np.abs(table).sum(axis=1), 1, 0))
-    used = _count_used(size, negligible)
-    error = max(e for *_, e in done) + negligible + 8.0 * EPS * scale
-    waves = int(used.max())
-    table = np.ascontiguousarray(table[..., :waves])
-    return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, used, error, _beyond(size[:, :waves], 0.0), scale)
+    waves = max(2, int((np.cumsum(size[:, ::-1], axis=1)[:, ::-1] > negligible).sum(axis=1).max()))
+    error = np.array([e for *_, e in done]) + size[:, waves:].sum(axis=1) + 8.0 * EPS * scale
+    table, size = np.ascontiguousarray(table[..., :waves]), np.ascontiguousarray(size[:, :waves])
+    return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, size, error, _beyond(size, 0.0))
 
 
 def _grid(theta: Array, azimuths: int) -> Array:

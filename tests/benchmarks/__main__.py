@@ -1,7 +1,8 @@
 """``python -m tests.benchmarks [section ...] [--quick] [--scene TEXT]`` prints tables; the whole run writes a page in docs.
 
-Sections: kernels (ns per evaluation against C), targets (the maps that gonio promises), accuracy (run time against error,
-gonio and its peers), size (cost against the size of the map), start (of the command line), band (of a posterior).
+Sections: kernels (ns per evaluation against C), models (the same for every model, and what it takes to compile all), targets
+(the maps that gonio promises), accuracy (run time against error, gonio and its peers), size (cost against the size of the
+map), start (of the command line), band (of a posterior).
 """
 
 from __future__ import annotations
@@ -9,9 +10,9 @@ from __future__ import annotations
 import argparse
 import time
 
-from tests.benchmarks import accuracy, band, kernels, page, size, start, targets
+from tests.benchmarks import accuracy, band, kernels, models, page, size, start, targets
 
-SECTIONS = ("kernels", "targets", "accuracy", "size", "start", "band")
+SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band")
 INTRODUCTION = """# Benchmarks
 
 What a reflectance map costs, beside what it costs a user who picks something else. All figures of this page are from one
@@ -63,6 +64,8 @@ def main() -> None:
 
     print(machine)
     tell("kernels", "One evaluation", page.kernels(speeds))
+    if "models" in chosen:
+        tell("models", "Every model", models.report(models.measure(), *models.compile_cold()))
     found, results, costs, started = [], [], {}, None
     if "targets" in chosen:
         found = list(targets.measure(quick=given.quick))
@@ -88,7 +91,7 @@ def main() -> None:
         tell("verdicts", "Promises", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
     if whole:
         page.picture(results, page.DOCS / page.PICTURE)
-        order = ("verdicts", "accuracy", "targets", "size", "kernels", "start", "band")
+        order = ("verdicts", "accuracy", "targets", "size", "kernels", "models", "start", "band")
         body = INTRODUCTION.format(machine=machine) + "".join(text[s] for s in order)
         (page.DOCS / "benchmarks.md").write_text(body, encoding="utf-8")
         print(f"\nwrote {page.DOCS / 'benchmarks.md'} and its picture")

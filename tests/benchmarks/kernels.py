@@ -51,17 +51,15 @@ class Speeds:
         return None if self.c_evaluate is None else self.gonio / self.c_evaluate
 
 
-def build(folder: Path) -> ctypes.CDLL | None:
-    """Compile kernels.c into the folder; None if there is no compiler."""
+def build(folder: Path, name: str = "kernels.c") -> ctypes.CDLL | None:
+    """Compile a file of this folder into another folder; None if there is no compiler."""
     compiler = shutil.which("gcc") or shutil.which("cc") or shutil.which("clang")
     if compiler is None:
         return None
-    target = folder / "kernels.so"
-    source = Path(__file__).with_name("kernels.c")
+    source = Path(__file__).with_name(name)
+    target = folder / f"{source.stem}.so"
     subprocess.run([compiler, *FLAGS, str(source), "-o", str(target), "-lm"], check=True)
-    library = ctypes.CDLL(str(target))
-    library.integrate.restype = ctypes.c_double
-    return library
+    return ctypes.CDLL(str(target))
 
 
 def measure(seconds: float = 0.2) -> Speeds:
@@ -88,6 +86,7 @@ def measure(seconds: float = 0.2) -> Speeds:
     with tempfile.TemporaryDirectory() as folder:
         library = build(Path(folder))
         if library is not None:
+            library.integrate.restype = ctypes.c_double
             p = np.array(list(ROUGH.values()))
             filled = np.empty(SIZE)
             weights = np.full(SIZE, 1.0 / SIZE)

@@ -1,0 +1,190 @@
+"""Nanoseconds per evaluation of every registered model, against the same formula in C, on one core; and what it takes to
+compile all of them.
+
+The formulas in C are models.c. Times are compared only of formulas that agree to 1e-10. A model without its counterpart in C
+is listed with its time alone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import itertools
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gonio.brdf import BRDF, Family, Model, Term, families
+from gonio.brdf.base import Array, accumulate
+from tests.benchmarks import page
+from tests.benchmarks.kernels import SIZE, _directions, build
+
+PROMISED = 1.5  # of gonio's time to C's
+AGREEMENT = 1e-10
+COMPILE_SECONDS = 180.0
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Nanoseconds per evaluation.
+
+    Attributes
+    ----------
+    c : float or None
+        None where models.c has no such formula, or none that agrees, or there is no compiler.
+    differs : float
+        Largest difference of gonio and C, relative to the largest value; nan without C.
+    jacobian : float
+        Of all derivatives; nan where there is no parameter.
+    """
+
+    name: str
+    gonio: float
+    c: float | None
+    differs: float
+    jacobian: float
+
+    @property
+    def ratio(self) -> float:
+        return math.nan if self.c is None else self.gonio / self.c
+
+
+def variants(family: Family) -> Iterator[Model]:
+    """The family with its default choices, then with each other choice by itself."""
+    yield family.model()
+    for key, allowed in family.choices.items():
+        for choice in allowed[1:]:
+            yield family.model(**{key: choice})
+
+
+def every() -> list[Model]:
+    """All compiled models of all families, each choice once."""
+    found = itertools.chain.from_iterable(variants(family) for family in families.FAMILIES.values())
+    return [model for model in found if model.function is not None]
+
+
+def typical(model: Model) -> Array:
+    """Parameters inside the ranges, derived numbers behind them: at the median of each prior."""
+    values = []
+    for p in model.parameters:
+        kind, a, b = p.prior
+        values.append(min(max(math.exp(a) if kind == "log_normal" else a + 0.37 * (b - a), p.lower), p.upper))
+    return model.complete(np.array(values))
+
+
+def c_name(model: Model) -> str:
+    """As models.c calls it: ``oren_nayar_full``; a flag by its own name."""
+    return "_".join([model.name, *(key if value == "true" else value for key, value in model.choices.items())])
+
+
+def measure(seconds: float = 0.15) -> list[Speed]:
+    """Every model, gonio and C in turns, so that a busy machine is unfair to neither; the best of many rounds counts."""
+    rng = np.random.default_rng(0)
+    w_i, w_r = _directions(rng), _directions(rng)
+    found = []
+    n = ctypes.c_long(SIZE)
+    with tempfile.TemporaryDirectory() as folder:
+        library = build(Path(folder), "models.c")
+        for model in every():
+            p, out, filled = typical(model), np.zeros(SIZE), np.zeros(SIZE)
+            kernel, brdf, differs = accumulate(model), BRDF([Term(model, p)]), math.nan
+            runs: dict[str, Callable[[], object]] = {"gonio": functools.partial(kernel, w_i, w_r, p, 1.0, out)}
+            loop = None if library is None else getattr(library, f"{c_name(model)}_loop", None)
+            if loop is not None:
+                *at, to = (a.ctypes.data_as(ctypes.c_void_p) for a in (w_i, w_r, p, filled))
+                in_c = functools.partial(loop, *at, ctypes.c_double(1.0), to, n)
+                in_c()
+                runs["gonio"]()
+                differs = float(np.max(np.abs(filled - out)) / np.max(out))
+                if differs <= AGREEMENT:
+                    runs["c"] = in_c
+            best = _turns(runs, seconds)
+            slopes = _turns({"all": functools.partial(brdf.jacobian, w_i, w_r)}, 0.3 * seconds)["all"]
+            found.append(Speed(model.expression, best["gonio"], best.get("c"), differs, slopes))
+    return found
+
+
+def report(found: Sequence[Speed], kernels: int, seconds: float) -> str:
+    """The figures as a table, what was promised and what is kept."""
+    rows = []
+    for s in found:
+        c = "-" if s.c is None else f"{s.c:.2f}"
+        ratio = "-" if s.c is None else f"{s.ratio:.2f}{'' if s.ratio <= PROMISED else ' MISS'}"
+        if s.differs > AGREEMENT:
+            ratio = f"values differ by {s.differs:.0e}"
+        rows.append([s.name, f"{s.gonio:.2f}", c, ratio, f"{s.jacobian:.1f}"])
+    compared = [s for s in found if s.c is not None]
+    kept = [s for s in compared if s.ratio <= PROMISED]
+    head = ["model", "ns per evaluation, one core", "C, the same formula", "gonio / C", "all derivatives, ns"]
+    return page.table(head, rows) + (
+        f"\n{len(kept)} of {len(compared)} formulas that were compared are within {PROMISED} times C"
+        f" (promised: all). Parameters are at the medians of their priors.\n"
+        f"\nThe whole suite, every model under a beam, a uniform and a hemispherical source and a disk, and its "
+        f"derivatives: {kernels} kernels, compiled by a process with an empty cache in {seconds:.0f} s "
+        f"(promised: {COMPILE_SECONDS:.0f} s; {'pass' if seconds <= COMPILE_SECONDS else 'MISS'}).\n"
+    )
+
+
+def _turns(runs: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:
+    best = dict.fromkeys(runs, np.inf)
+    for run in runs.values():
+        run()
+    end, rounds = time.perf_counter() + seconds * len(runs), 0
+    while time.perf_counter() < end or rounds < 5:
+        rounds += 1
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            best[name] = min(best[name], (time.perf_counter() - start) / SIZE * 1e9)
+    return best
+
+
+_COMPILE = """
+import time
+start = time.perf_counter()
+from tests.benchmarks.models import compile_all
+count = compile_all()
+print(count, time.perf_counter() - start)
+"""
+
+
+def compile_all() -> int:
+    """Use every model under every rule of the integrator; how many kernels had to be compiled."""
+    import gonio
+    from gonio import jit
+
+    sources = [
+        gonio.source.make("collimated", theta=0.5, phi=0.3),
+        gonio.source.make("uniform", radiance=1.0),
+        gonio.source.make("hemispherical", radiance=1.0),
+        gonio.source.make("disk", theta=0.6, phi=0.2, half_angle=0.1, radiance=1.0),
+    ]
+    p = np.linspace(-2.0, 2.0, 5)
+    for model in every():
+        brdf = BRDF([Term(model, typical(model))]) if model.parameters else None
+        if brdf is None:
+            continue
+        brdf.jacobian(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.6, 0.8]))
+        for source in sources:
+            gonio.reflectance_map(brdf, source, p[:, None], p, rtol=1e-2)
+    return jit.compiled_count()
+
+
+def compile_cold() -> tuple[int, float]:
+    """Kernels and seconds of a process that finds an empty cache."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"NUMBA_CACHE_DIR": folder}
+        done = subprocess.run(
+            [sys.executable, "-c", _COMPILE], env=environment, cwd=ROOT, capture_output=True, text=True, check=True
+        )
+    count, seconds = done.stdout.split()[-2:]
+    return int(count), float(seconds)
