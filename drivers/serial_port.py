@@ -6,14 +6,18 @@ reads of the port that comes back wait at most one short slice, so that the call
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import functools
 import logging
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from gonio.errors import DeviceError
+from gonio.lock import FileLock, HeldError
 
 logger = logging.getLogger(__name__)
 
@@ -50,31 +54,74 @@ def open_port(url: str, *, baud: int, slice_s: float = READ_SLICE_S, write_timeo
 
     Notes
     -----
-    pyserial's ``exclusive`` is an advisory lock that only other polite programs see; TIOCEXCL makes the kernel refuse
-    further opens too (root excepted). It is set on real ports only: the flag lives as long as the terminal, and a
-    simulator keeps its pseudo-terminal open after us.
+    A lock file names the process that holds a path, for the message that another one gets. pyserial's ``exclusive`` is an
+    advisory lock that other polite programs see; TIOCEXCL makes the kernel refuse further opens too (root excepted). It is
+    set on real ports only: the flag lives as long as the terminal, and a simulator keeps its pseudo-terminal open after us.
     """
     import serial
 
     plain = "://" not in url
     options: dict[str, Any] = {"timeout": slice_s, "write_timeout": write_timeout_s}
-    if plain:
-        options["exclusive"] = True
     try:
-        try:
+        if plain:
+            port = _exclusive(url, baud, options)
+        else:
             port = serial.serial_for_url(url, baudrate=baud, **options)
-        except OSError as error:
-            # macOS: a pseudo-terminal has no line rate and refuses the uncommon ones (serial.SerialException is an
-            # OSError, but only the raw ioctl error has this number).
-            if not plain or error.errno != errno.ENOTTY or baud == _PLAIN_BAUD:
-                raise
-            port = serial.serial_for_url(url, baudrate=_PLAIN_BAUD, **options)
         port.reset_input_buffer()
     except (OSError, ValueError) as error:
         raise DeviceError(_explain(url, baud, error)) from error
-    if plain:
-        _lock_terminal(url, port)
     return port
+
+
+def lock_path(url: str) -> Path:
+    """File that names the process which holds a port, whatever name the port was given."""
+    name = str(Path(url).resolve()).strip("/\\").replace("/", "-").replace("\\", "-").replace(":", "")
+    return Path(tempfile.gettempdir()) / "gonio-ports" / f"{name}.lock"
+
+
+def _exclusive(path: str, baud: int, options: dict[str, Any]) -> Any:
+    """A port by its path, opened by nobody else; closing it gives back its lock."""
+    lock = FileLock(lock_path(path))
+    with contextlib.suppress(FileExistsError):
+        lock_path(path).parent.mkdir()
+        lock_path(path).parent.chmod(0o1777)  # for all users, each for his own files
+    try:
+        lock.acquire()
+    except HeldError as holder:
+        raise DeviceError(f"Port {path} is in use by {holder}; end that one first.") from None
+    except OSError as error:  # the kernel's own locks below still hold
+        logger.warning("port %s: no lock file (%s)", path, error)
+    try:
+        try:
+            port = _owned()(path, baud, exclusive=True, **options)
+        except OSError as error:
+            # macOS: a pseudo-terminal has no line rate and refuses the uncommon ones (serial.SerialException is an
+            # OSError, but only the raw ioctl error has this number).
+            if error.errno != errno.ENOTTY or baud == _PLAIN_BAUD:
+                raise
+            port = _owned()(path, _PLAIN_BAUD, exclusive=True, **options)
+    except BaseException:
+        lock.release()
+        raise
+    port.lock = lock
+    _lock_terminal(path, port)
+    return port
+
+
+@functools.cache
+def _owned() -> Any:
+    """pyserial's port for paths, which gives back its lock when it is closed."""
+    import serial
+
+    class OwnedPort(serial.Serial):  # type: ignore[misc]
+        lock: FileLock | None = None
+
+        def close(self) -> None:
+            super().close()
+            if self.lock is not None:
+                self.lock.release()
+
+    return OwnedPort
 
 
 def _lock_terminal(url: str, port: Any) -> None:

@@ -11,6 +11,7 @@ import contextlib
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal
@@ -19,10 +20,10 @@ import numpy as np
 
 from gonio.errors import DatasetError
 from gonio.interfaces import Frame
+from gonio.lock import FileLock, HeldError
 from gonio.samples import BRDFSamples, SharedError
 from gonio.scan import frames as frame_files
 from gonio.scan.journal import DATABASE, Journal, insert
-from gonio.scan.lock import RunLock
 from gonio.scan.records import BlockRecord, PoseRecord, from_json, to_json
 
 Kind = Literal["scan", "import"]
@@ -105,7 +106,8 @@ class Run:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def lock(self) -> RunLock:
+    @contextmanager
+    def lock(self) -> Iterator[None]:
         """A context in which this process alone scans into the run.
 
         Raises
@@ -113,7 +115,21 @@ class Run:
         DatasetError
             On entering, if another process does; the message names it.
         """
-        return RunLock(self.path / "scan.lock")
+        lock = FileLock(self.path / "scan.lock")
+        try:
+            lock.acquire()
+        except HeldError as holder:
+            raise DatasetError(
+                f"{self.path} is being scanned by {holder}; wait for it to end, or stop it with Ctrl-C"
+            ) from None
+        except OSError as error:
+            raise DatasetError(
+                f"{self.path / 'scan.lock'} cannot be written: {error.strerror}; check the folder's permissions"
+            ) from error
+        try:
+            yield
+        finally:
+            lock.release()
 
     # -- documents and attributes
 

@@ -7,6 +7,7 @@ times as fast as the wall's.
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -93,7 +94,7 @@ def test_two_axes_move_and_are_measured(bench: Bench, way: str) -> None:
 
 def test_a_port_is_opened_once(bench: Bench) -> None:
     with Bus(bench.path, clock=bench.clock) as bus:
-        with pytest.raises(DeviceError, match=r"is in use by another program; close that one first"):
+        with pytest.raises(DeviceError, match=rf"is in use by process {os.getpid()} on .* since .*; end that one first"):
             Bus(bench.path, clock=bench.clock).open()
         assert bus.ping(1)[0] == 1020
     with Bus(bench.path, clock=bench.clock, timeout_s=2.0) as bus:  # and free again afterwards
