@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gonio import texels
 from gonio.errors import GeometryError, ParameterError
 from gonio.geometry import unit_vector
 
@@ -175,29 +176,12 @@ class EnvironmentMap(Field):
         return float(min(np.pi / n_theta, 2.0 * np.pi / n_phi))
 
     def at(self, directions: Array) -> Array:
-        n_theta, n_phi = self.samples.shape
-        theta = np.arctan2(np.hypot(directions[:, 0], directions[:, 1]), directions[:, 2])
-        row = theta * (n_theta / np.pi) - 0.5
-        column = np.arctan2(directions[:, 1], directions[:, 0]) * (n_phi / (2.0 * np.pi)) - 0.5
-        j = np.floor(column).astype(np.intp)
-        v = column - j
+        out, given = np.empty(len(directions)), np.ascontiguousarray(directions)
         if self.interpolation == "bilinear":
-            row = np.clip(row, 0.0, n_theta - 1.0)
-            i = np.minimum(np.floor(row).astype(np.intp), max(n_theta - 2, 0))
-            u, below = row - i, np.minimum(i + 1, n_theta - 1)
-            left, right = j % n_phi, (j + 1) % n_phi
-            above = (1.0 - v) * self.samples[i, left] + v * self.samples[i, right]
-            under = (1.0 - v) * self.samples[below, left] + v * self.samples[below, right]
-            total: Array = (1.0 - u) * above + u * under
-            return total
-        i = np.floor(row).astype(np.intp)
-        control = self.control_points
-        total = np.zeros(len(directions))
-        across = b_spline(v)
-        for di, weight in zip(range(-1, 3), b_spline(row - i), strict=True):
-            for dj, other in zip(range(-1, 3), across, strict=True):
-                total += weight * other * control[i + di + 2, (j + dj) % n_phi]
-        return total
+            texels.bilinear(given, self.samples, out)
+        else:
+            texels.smooth(given, self.control_points, out)
+        return out
 
     @functools.cached_property
     def control_points(self) -> Array:
@@ -211,12 +195,6 @@ class EnvironmentMap(Field):
         whole = np.fft.irfft2(spectrum, circles.shape)
         control: Array = np.concatenate((whole[-2:], whole[: n_theta + 2]))
         return control
-
-
-def b_spline(t: Array) -> tuple[Array, Array, Array, Array]:
-    """Values of the four uniform cubic B-splines that cover a point t in [0, 1) between two knots."""
-    s = 1.0 - t
-    return s**3 / 6.0, (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * s**2 + 3.0 * s**3) / 6.0, t**3 / 6.0
 
 
 def sampled_b_spline(frequency: Array) -> Array:

@@ -45,7 +45,7 @@ CHOICES = {
     "shadowing": ("smith", "smith_separable", "v_groove"),
     "multiple_scattering": ("false", "true"),
 }
-LOWEST = 1e-30  # cosine at and below which a direction counts as at the horizon: squares must not underflow
+LOWEST = 1e-30  # cosine below which a lit direction is taken as on the horizon, its limit: squares must not underflow
 
 
 @jit.model
@@ -81,9 +81,9 @@ def _function(distribution: str, fresnel: str, shadowing: str, repeated: bool) -
     reflected = FRESNEL[fresnel].factor(first)
 
     def once(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-        lit = (zi > LOWEST) & (zr > LOWEST)  # no branch: the loop vectorises
-        mu_i = zi if lit else 1.0
-        mu_r = zr if lit else 1.0
+        lit = (zi > 0.0) & (zr > 0.0)  # no branch: the loop vectorises
+        mu_i = zi if zi > LOWEST else LOWEST
+        mu_r = zr if zr > LOWEST else LOWEST
         x, y, z = xi + xr, yi + yr, mu_i + mu_r
         dx, dy, dz = xi - xr, yi - yr, mu_i - mu_r
         s2 = x * x + y * y  # l^2 sin^2 theta_h
@@ -101,9 +101,9 @@ def _function(distribution: str, fresnel: str, shadowing: str, repeated: bool) -
     lost, numbers = again.lost(facets, at + facets.count), at + facets.count
 
     def more(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-        lit = (zi > LOWEST) & (zr > LOWEST)
-        mu_i = zi if lit else 1.0
-        mu_r = zr if lit else 1.0
+        lit = (zi > 0.0) & (zr > 0.0)
+        mu_i = zi if zi > LOWEST else LOWEST
+        mu_r = zr if zr > LOWEST else LOWEST
         value = single(xi, yi, zi, xr, yr, zr, p) + p[0] * p[numbers] * lost(mu_i, xi * xi + yi * yi, p) * lost(
             mu_r, xr * xr + yr * yr, p
         )

@@ -148,21 +148,17 @@ class Run:
         grid, rtol = self.gradients, self.rtol
         coarse = not isinstance(field, EnvironmentMap) or field.samples.size <= _TEXELS
         most = 4 * _FEW if coarse else _FEW  # for cells
-        scene = scene_of(step.term, field, rtol, step.effort, threads)
-        if slopes_are_few(grid):
+        handful = coarse and grid.size <= _HANDFUL
+        if handful or slopes_are_few(grid):
             elements, spare = grid.elements(), self._spare(value, error)
-            if coarse and grid.size <= _HANDFUL:
+            if handful:
                 v, e = self._cells(step, field, elements, spare)
             else:
-                v, e = integrate_rings(scene, elements, rtol=rtol, atol=spare)
-                missed = np.flatnonzero(e > np.maximum(rtol * np.abs(v), spare))
-                if 0 < missed.size <= most:
-                    again, left = self._cells(step, field, elements.select(missed), spare[missed])
-                    better = left < e[missed]
-                    v[missed[better]], e[missed[better]] = again[better], left[better]
+                v, e = self._slopes(step, field, elements, spare, most, threads)
             value += v
             error += e
             return _largest(e, value, ROUNDING * np.max(np.abs(value), initial=0.0))
+        scene = scene_of(step.term, field, rtol, step.effort, threads)
         room = Room(grid, rtol, self.atol, value, error, threads)
         table = tabulate(scene, rtol, room)
         negligible = ROUNDING * max(room.largest, table.largest)
@@ -183,6 +179,19 @@ class Run:
             value[missed[better]] += (again - v)[better]
             error[missed[better]] += (left - e)[better]
         return max(worst, _largest(error[missed], value[missed], negligible))
+
+    def _slopes(
+        self, step: Step, field: Field, elements: Elements, spare: Array, most: int, threads: int
+    ) -> tuple[Array, Array]:
+        """Rings slope by slope; up to `most` that they leave above their tolerance by cells."""
+        scene = scene_of(step.term, field, self.rtol, step.effort, threads)
+        v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare)
+        missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
+        if 0 < missed.size <= most:
+            again, left = self._cells(step, field, elements.select(missed), spare[missed])
+            better = left < e[missed]
+            v[missed[better]], e[missed[better]] = again[better], left[better]
+        return v, e
 
     def _spare(self, value: Array, error: Array) -> Array:
         """What steps before leave of the tolerance, which is relative to the sum."""

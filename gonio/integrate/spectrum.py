@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.errors import IntegrationError
-from gonio.fields import EnvironmentMap, Field, FunctionField, Lobes, b_spline
+from gonio.fields import EnvironmentMap, Field, FunctionField, Lobes
 from gonio.geometry import unit_vector
+from gonio.texels import b_spline
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
