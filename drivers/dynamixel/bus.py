@@ -30,6 +30,7 @@ from drivers.dynamixel.registers import (
     decode_block,
     hardware_errors,
 )
+from drivers.dynamixel.ticks import TickClock
 from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError, HardwareStatusError, ProtocolError
 from gonio.interfaces import Clock
 
@@ -107,6 +108,7 @@ class Bus:
         )
         self._members: dict[int, Member] = {}
         self._last: dict[int, int] = {}  # last position seen [counts]
+        self._ticks: dict[int, TickClock] = {}
 
     @property
     def timeouts(self) -> int:
@@ -179,12 +181,42 @@ class Bus:
 
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque goes off, RAM registers fall back to their defaults."""
+        self._ticks.pop(servo_id, None)  # its clock begins anew
         self._line.ask(servo_id, INST_REBOOT, b"", 0)
 
     # -- state
 
     def block(self, servo_id: int, *, hasty: bool = False) -> Block:
-        """State of a servo now."""
+        """State of a servo now.
+
+        A state that is not of the time at which it was asked for (`TickClock`) is not believed: the line is drained, and
+        the servo asked again. A hasty question goes without this.
+
+        Raises
+        ------
+        ProtocolError
+            If no state makes sense.
+        """
+        with self._line.lock:
+            doubted: Block | None = None
+            for _ in range(self._line.attempts):
+                state = self._state(servo_id, hasty)
+                clock = self._ticks.setdefault(servo_id, TickClock(state))
+                if hasty or clock.accepts(state):
+                    self._last[servo_id] = state.position
+                    return state
+                logger.info("%s: a state of another time (tick %d), asked again", self.label(servo_id), state.tick)
+                if doubted is not None and (restarted := TickClock(doubted)).accepts(state):
+                    self._ticks[servo_id] = restarted  # its clock began anew
+                    return state
+                self._line.distrust(servo_id)
+                doubted = state
+        raise ProtocolError(
+            f"{self.label(servo_id)}: {self._line.attempts} states in a row are of other times than the questions; "
+            "check the cable, the adapter, and that no two servos share an id."
+        )
+
+    def _state(self, servo_id: int, hasty: bool) -> Block:
         parameters = BLOCK_ADDRESS.to_bytes(2, "little") + BLOCK_SIZE.to_bytes(2, "little")
         sent_s = 0.0
 
@@ -195,9 +227,7 @@ class Bus:
         data, error = self._line.ask(servo_id, INST_READ, parameters, BLOCK_SIZE, hasty=hasty, started=started)
         received_s = self.clock.now()
         self._refuse(servo_id, "reading its state", error)
-        block = decode_block(data, alert=bool(error & 0x80), sent_s=sent_s, received_s=received_s)
-        self._last[servo_id] = block.position
-        return block
+        return decode_block(data, alert=bool(error & 0x80), sent_s=sent_s, received_s=received_s)
 
     def agreed_block(self, servo_id: int) -> Block:
         """The later of two consecutive blocks that agree: same goal, and no farther apart than a servo can turn."""

@@ -116,6 +116,10 @@ class Line:
             )
         return {int(servo_id): (int(model), int(firmware)) for servo_id, (model, firmware) in sorted(found.items())}
 
+    def distrust(self, servo_id: int) -> None:
+        """Drain and fence before this servo is asked anything more: an answer that came was not to the question."""
+        self._owing.add(servo_id)
+
     def ask(
         self,
         servo_id: int,

@@ -1,0 +1,227 @@
+"""A bad line: damaged, lost, late, repeated and foreign packets. No wrong angle is ever believed.
+
+What stands between the driver and the simulated servos is a wire that damages bytes, both ways, as cables, connectors and
+adapters do. The servos turn all the time, so that an old angle is a wrong one. The truth is the shaft of the simulator.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from drivers.dynamixel import Bus
+from drivers.dynamixel import registers as reg
+from gonio.errors import DeviceError
+from sim import port
+from sim.clock import VirtualClock
+from sim.dynamixel.bus import DynamixelBus, Reply
+from sim.dynamixel.servo import Servo as SimServo
+from tests.gates import record
+
+SEED = 5
+SLACK_COUNTS = 1.0  # rounding of the encoder
+Rng = np.random.Generator
+Reading = tuple[int, float, float]  # position [counts], rig time before and after [s]
+
+
+# --- damage --------------------------------------------------------------------------------------------------------------
+
+
+def flipped(data: bytes, rng: Rng) -> bytes:
+    """One to eight wrong bits."""
+    bits = rng.choice(8 * len(data), min(8 * len(data), int(rng.integers(1, 9))), replace=False)
+    out = bytearray(data)
+    for bit in bits:
+        out[bit // 8] ^= 1 << (bit % 8)
+    return bytes(out)
+
+
+def burst(data: bytes, rng: Rng) -> bytes:
+    """Two to eight bytes in a row are noise."""
+    start, length = int(rng.integers(len(data))), int(rng.integers(2, 9))
+    noise = rng.bytes(len(data[start : start + length]))
+    return data[:start] + noise + data[start + length :]
+
+
+def dropped(data: bytes, rng: Rng) -> bytes:
+    """One to four bytes are lost, or all of them."""
+    if rng.random() < 0.1:
+        return b""
+    start, length = int(rng.integers(len(data))), int(rng.integers(1, 5))
+    return data[:start] + data[start + length :]
+
+
+def doubled(data: bytes, rng: Rng) -> bytes:
+    """Some bytes come twice."""
+    start, length = int(rng.integers(len(data))), int(rng.integers(1, 5))
+    return data[: start + length] + data[start:]
+
+
+def inserted(data: bytes, rng: Rng) -> bytes:
+    """One to four bytes of noise in between."""
+    start = int(rng.integers(len(data) + 1))
+    return data[:start] + rng.bytes(int(rng.integers(1, 5))) + data[start:]
+
+
+DAMAGE: dict[str, Callable[[bytes, Rng], bytes]] = {
+    f.__name__: f for f in (flipped, burst, dropped, doubled, inserted)
+}
+
+
+@dataclass
+class Wire:
+    """A device for `sim.port`: the servos behind a bad line.
+
+    Attributes
+    ----------
+    line : DynamixelBus
+    rng : Generator
+    damage : float
+        Share of the packets, both ways, that are damaged.
+    stray : float
+        Share of the answers that come late, come twice, or are preceded by one that belongs to an earlier question.
+    """
+
+    line: DynamixelBus
+    rng: Rng
+    damage: float = 0.0
+    stray: float = 0.0
+    seen: Counter[str] = field(default_factory=Counter)
+    _earlier: list[bytes] = field(default_factory=list)
+
+    def feed(self, data: bytes, now: float) -> list[Reply]:
+        replies = self.line.feed(self._through(data), now)
+        if not replies:
+            self.line.idle()  # an unfinished packet is forgotten in the silence that follows
+        carried: list[Reply] = []
+        for delay, answer in replies:
+            carried += self._strayed(delay, self._through(answer))
+            self._earlier = [*self._earlier[-20:], answer]
+        return [(delay, answer) for delay, answer in carried if answer]
+
+    def idle(self) -> None:
+        self.line.idle()
+
+    def _through(self, data: bytes) -> bytes:
+        if self.rng.random() >= self.damage:
+            return data
+        name = str(self.rng.choice(list(DAMAGE)))
+        damaged = DAMAGE[name](data, self.rng)
+        self.seen[name] += damaged != data
+        return damaged
+
+    def _strayed(self, delay: float, answer: bytes) -> list[Reply]:
+        if self.rng.random() >= self.stray:
+            return [(delay, answer)]
+        kind = str(self.rng.choice(["late", "twice", "foreign", "before"]))
+        self.seen[kind] += 1
+        if kind == "late":  # the time-out is half a second
+            return [(float(self.rng.uniform(0.4, 1.2)), answer)]
+        if kind == "twice":
+            return [(delay, answer), (delay + float(self.rng.choice([0.0, 0.3, 0.7])), answer)]
+        other = self._earlier[int(self.rng.integers(len(self._earlier)))] if self._earlier else answer
+        return [(delay, other), (delay, answer)] if kind == "foreign" else [(delay, other)]
+
+
+# --- the experiment ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Outcome:
+    """How many angles were read, how many of them wrong, and how many readings failed."""
+
+    angles: int = 0
+    wrong: int = 0
+    failed: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def hit(self) -> int:
+        return sum(self.faults.values())
+
+    @property
+    def recovered(self) -> float:
+        """Share of the faults that did not end in an error."""
+        return 1.0 - self.failed / max(1, self.hit)
+
+
+Reader = Callable[[Bus, int], Reading]
+
+
+def believed(bus: Bus, servo_id: int) -> Reading:
+    """An angle as the driver reads it."""
+    block = bus.agreed_block(servo_id)
+    return block.position, block.sent_s, block.received_s
+
+
+def run(faults: int, *, damage: float = 0.0, stray: float = 0.0, reader: Reader = believed) -> Outcome:
+    """Read angles of two turning servos until so many faults have struck."""
+    clock, rng = VirtualClock(), np.random.default_rng(SEED)
+    servos = {k: SimServo(k, initial_counts=1000.0 * k) for k in (1, 2)}
+    wire = Wire(DynamixelBus(list(servos.values())), rng)
+    with Bus(port.attach("noisy", wire, clock), clock=clock, now=clock.now, attempts=5) as bus:
+        for k in servos:
+            bus.write(k, reg.PROFILE_VELOCITY, 20)
+            bus.write(k, reg.TORQUE_ENABLE, 1)
+        wire.damage, wire.stray = damage, stray
+        outcome = Outcome(faults=wire.seen)
+        due_s = 0.0
+        while outcome.hit < faults:
+            if clock.now() >= due_s:  # the simulator's own hand, so that the turning does not depend on the wire
+                for servo in servos.values():
+                    goal = int(rng.integers(200, 3900)).to_bytes(4, "little")
+                    servo.write(reg.GOAL_POSITION.address, goal, clock.now())
+                due_s = clock.now() + 2.0
+            k = int(rng.integers(1, 3))
+            try:
+                position, sent_s, received_s = reader(bus, k)
+            except DeviceError:
+                outcome.failed += 1
+                continue
+            outcome.angles += 1
+            shaft = [servos[k].shaft_counts(t) for t in np.linspace(sent_s, received_s, 9)]
+            outcome.wrong += not min(shaft) - SLACK_COUNTS <= position <= max(shaft) + SLACK_COUNTS
+    port.detach("noisy")
+    return outcome
+
+
+LANES = {"damaged": {"damage": 0.1}, "late, repeated or foreign": {"stray": 0.2}}
+
+
+@pytest.mark.parametrize("lane", LANES)
+def test_no_wrong_angle(lane: str) -> None:
+    outcome = run(1500, **LANES[lane])
+    assert outcome.angles > 1000
+    assert outcome.wrong == 0
+    assert outcome.recovered >= 0.99
+
+
+def test_the_experiment_can_find_wrong_angles() -> None:
+    """A reader that believes a single register is deceived on the same wire."""
+
+    def credulous(bus: Bus, servo_id: int) -> Reading:
+        sent_s = bus.clock.now()
+        return bus.read(servo_id, reg.PRESENT_POSITION), sent_s, bus.clock.now()
+
+    assert run(500, **LANES["late, repeated or foreign"], reader=credulous).wrong > 50
+
+
+@pytest.mark.gate
+@pytest.mark.parametrize(("lane", "faults"), [("damaged", 1_000_000), ("late, repeated or foreign", 100_000)])
+def test_no_wrong_angle_in_many(lane: str, faults: int) -> None:
+    outcome = run(faults, **LANES[lane])
+    kinds = ", ".join(f"{name} {count}" for name, count in sorted(outcome.faults.items()))
+    record(
+        f"angles over a bad line, {lane}",
+        f"{outcome.wrong} wrong of {outcome.angles} accepted; {outcome.hit} faults ({kinds}), "
+        f"{100 * outcome.recovered:.3f} % without an error",
+        "0 wrong, >= 99 % recovered",
+        str(SEED),
+        "pytest -m gate tests/property/test_noisy_line.py",
+    )
+    assert outcome.wrong == 0
+    assert outcome.recovered >= 0.99
