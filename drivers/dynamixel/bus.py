@@ -206,11 +206,12 @@ class Bus:
                     self._last[servo_id] = state.position
                     return state
                 logger.info("%s: a state of another time (tick %d), asked again", self.label(servo_id), state.tick)
-                if doubted is not None and (restarted := TickClock(doubted)).accepts(state):
-                    self._ticks[servo_id] = restarted  # its clock began anew
+                if doubted is not None and clock.restarted(doubted, state):
+                    self._ticks[servo_id] = TickClock(state)
                     return state
                 self._line.distrust(servo_id)
                 doubted = state
+            del self._ticks[servo_id]  # the rig's clock may have stood still; the next question begins anew
         raise ProtocolError(
             f"{self.label(servo_id)}: {self._line.attempts} states in a row are of other times than the questions; "
             "check the cable, the adapter, and that no two servos share an id."
