@@ -12,7 +12,9 @@ from drivers.dynamixel.ticks import TickClock
 AT_REST = decode_block(bytes(BLOCK_SIZE), alert=False, sent_s=0.0, received_s=0.0)
 
 
-def state(sent_s: float, *, of_s: float | None = None, rate: float = 1.0, took_s: float = 0.001, began_s: float = -5.0) -> Block:
+def state(
+    sent_s: float, *, of_s: float | None = None, rate: float = 1.0, took_s: float = 0.001, began_s: float = -5.0
+) -> Block:
     """A state asked for at `sent_s` [s] by a servo that began at `began_s`, in truth of the time `of_s`."""
     true_s = sent_s + 0.5 * took_s if of_s is None else of_s
     return replace(AT_REST, tick=int(1000.0 * rate * (true_s - began_s)) % 32768, sent_s=sent_s, received_s=sent_s + took_s)
