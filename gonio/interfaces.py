@@ -83,6 +83,10 @@ class Axis(Protocol):
     @property
     def limits(self) -> AxisLimits: ...
 
+    def check(self, angle: float) -> None:
+        """Raise `LimitError` if `move_to` would; nothing is sent."""
+        ...
+
     def move_to(self, angle: float) -> None:
         """Start moving to `angle` [rad]; returns at once. Raises `LimitError` before a byte is sent."""
         ...

@@ -179,6 +179,10 @@ class Servo:
         """Host-side limits; the servo holds the same."""
         return self._limits
 
+    def check(self, angle: float) -> None:
+        """Raise `LimitError` if an angle [rad] is outside the limits; nothing is sent."""
+        self._joint.goal(angle)
+
     def move_to(self, angle: float) -> None:
         """Start moving to `angle` [rad]; returns at once.
 
