@@ -158,12 +158,13 @@ def compare(
     """
     omega_i, omega_r = pairs(thin)
     worst, where, count = 0.0, "nowhere", 0
+    geometries = [Geometry(*pair) for pair in zip(omega_i, omega_r, strict=True)]
     for given in sets:
         got = gonio.brdf.make(name, **given).evaluate(omega_i, omega_r)
         numbers = {key: mpf(value) for key, value in given.items() if not isinstance(value, str | bool)}
         for k in range(len(got)):
             with mpmath.workdps(digits):
-                true = formula(Geometry(omega_i[k], omega_r[k]), **numbers)
+                true = formula(geometries[k], **numbers)
                 error = _error(float(got[k]), true)
             count += 1
             if error > worst:

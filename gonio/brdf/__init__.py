@@ -47,6 +47,9 @@ def make(name: str | Model, **parameters: Any) -> BRDF:
     if isinstance(name, Model):
         return BRDF([Term(name, name.values(parameters))])
     family = find(name)
-    chosen = {key: parameters.pop(key) for key, value in [*parameters.items()] if isinstance(value, str | bool)}
-    model = family.model(**chosen)
+    model = family.model(**{key: parameters.pop(key) for key in family.choices if key in parameters})
+    unknown = set(parameters) - {parameter.name for parameter in model.parameters}
+    for key in sorted(unknown):
+        if isinstance(parameters[key], str | bool):
+            family.model(**{key: parameters[key]})  # tells which choices there are
     return BRDF([Term(model, model.values(parameters))])

@@ -60,7 +60,13 @@ class Parameter:
 
     def check(self, value: float, owner: str) -> float:
         """The value as float, or a `ParameterError` naming what is allowed."""
-        number = float(value)
+        try:
+            number = float("text" if isinstance(value, str | bool) else value)
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"{owner}: {self.name} = {value!r} is not a number; choose one inside [{self.lower:g}, {self.upper:g}] "
+                f"{self.unit}"
+            ) from None
         if not (math.isfinite(number) and self.lower <= number <= self.upper):
             raise ParameterError(
                 f"{owner}: {self.name} = {number:g} is outside [{self.lower:g}, {self.upper:g}] {self.unit}; "

@@ -10,6 +10,8 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from gonio.brdf.base import Model, _suggest
 from gonio.brdf.blinn import ASHIKHMIN_SHIRLEY, BLINN_PHONG
 from gonio.brdf.eon import EON
@@ -60,7 +62,7 @@ class Family:
             if key not in self.choices:
                 known = f"it has: {', '.join(self.choices)}" if self.choices else "leave it out"
                 raise ParameterError(f"{self.name} has no choice {key!r}{_suggest(key, self.choices)}; {known}")
-            made[key] = str(value).lower() if isinstance(value, bool) else str(value)
+            made[key] = str(value).lower() if isinstance(value, bool | np.bool_) else str(value)
             if made[key] not in self.choices[key]:
                 raise ParameterError(
                     f"{self.name} has no {key} {value!r}{_suggest(made[key], self.choices[key])}; "

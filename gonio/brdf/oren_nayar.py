@@ -67,7 +67,7 @@ def full_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p
     mu_i = zi if lit else 1.0
     mu_r = zr if lit else 1.0
     s_i, s_r = math.sqrt(xi * xi + yi * yi), math.sqrt(xr * xr + yr * yr)
-    steep = mu_i > mu_r  # omega_i is the one at beta
+    steep = (mu_i > mu_r) | ((mu_i == mu_r) & (s_i < s_r))  # omega_i is the one at beta
     mu_a, s_a = (mu_r if steep else mu_i), (s_r if steep else s_i)
     mu_b, s_b = (mu_i if steep else mu_r), (s_i if steep else s_r)
     up_b = TWO_OVER_PI * arctan(mu_b, s_b)  # 1 - 2 beta / pi

@@ -101,7 +101,7 @@ def lafortune_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: flo
     less_z = 0.5 * (z2 + (xi * xi + yi * yi) + (xr * xr + yr * yr))
     less = both * less + (r_xy - both) * less_xy + (r_z - both) * less_z
     along = 1.0 - less if less < 0.5 else (c_xy * two_products(xi, xr, yi, yr) + c_z * (zi * zr)) / largest
-    lit = (zi > 0.0) & (zr > 0.0) & (along > 0.0)
+    lit = (zi > 0.0) & (zr > 0.0) & (along > 0.0) & (r_xy + r_z > 0.0)
     value = k_s * (n + 2.0) * INV_TWO_PI * exp(n * log_near(along if lit else 1.0, -less))
     return value if lit else 0.0
 

@@ -7,7 +7,7 @@ the surface throws back the share :math:`\bar F_{int}`, which meets the base aga
 ``specular`` or a microfacet model. With rho = 1 gloss and base together lose nothing: the directional albedo is
 :math:`1 - F(\mu_r)`.
 
-1 - F comes from Fresnel's transmittances, which keep their digits at the horizon, and
+1 - F comes from Fresnel's amplitudes multiplied out, and where F nears 1 from the transmittances; and
 :math:`n^2(1-\bar F_{int}) = 1-\bar F_{ext}` from the integral of F outside, exactly: with :math:`m^2 = n^2 - 1`,
 :math:`\mu = m\sinh t` and :math:`\sqrt{m^2 + \mu^2} = m\cosh t` it has no root, and n = 1 no special case.
 
@@ -52,11 +52,16 @@ def diffuse_reflectance(n: float) -> float:
 @jit.model
 def transmitted(mu: float, n2: float, m2: float) -> float:
     """1 - F for a cosine mu from outside; n2 = n^2, m2 = n^2 - 1."""
-    q = math.sqrt(m2 + mu * mu)  # n cos theta_t
+    mu2 = mu * mu
+    q = math.sqrt(m2 + mu2)  # n cos theta_t
     s, p = mu + q, n2 * mu + q
     both = 1.0 / (s * p)
-    s, p = s * both, p * both  # 1 / p, 1 / s
-    return 2.0 * mu * q * (p * p + n2 * s * s)
+    s, p = p * both, s * both  # 1 / s, 1 / p
+    r_s, r_p = m2 * s * s, m2 * ((n2 + 1.0) * mu2 - 1.0) * p * p
+    # 1 - r^2; where that would cancel, multiplied out
+    t_s = 1.0 - r_s * r_s if r_s < 0.5 else 4.0 * mu * q * s * s
+    t_p = 1.0 - r_p * r_p if abs(r_p) < 0.5 else 4.0 * n2 * mu * q * p * p
+    return 0.5 * (t_s + t_p)
 
 
 @jit.model

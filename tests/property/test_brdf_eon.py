@@ -1,4 +1,4 @@
-"""EON: 40 digits, nothing lost at albedo 1, limits, refusals; and the arctangent that it shares."""
+"""EON: nothing lost at albedo 1, Lambert's surface at roughness 0; and the arctangent that it shares."""
 
 from __future__ import annotations
 
@@ -7,44 +7,15 @@ import math
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from mpmath import acos, mpf, pi
 
 import gonio
 from gonio import jit
 from gonio.brdf.arctangent import arctan
-from tests.brdf_truth import Geometry, check_refusals, compare, parameter_sets, reciprocity
 
 make = gonio.brdf.make
-ROUGHNESSES = (0.0, 1e-12, 1e-8, 0.3, 1.0)
 
 
-def eon(g: Geometry, albedo: mpf, roughness: mpf) -> mpf:
-    """Portsmouth, Kutz & Hill 2025: single scattering of Fujii's form, and the compensation of its albedo."""
-    r = roughness
-    a = 1 / (1 + (mpf(1) / 2 - 2 / (3 * pi)) * r)
-    mean = a * (1 + (mpf(2) / 3 - 28 / (15 * pi)) * r)
-
-    def e(theta: mpf) -> mpf:
-        mu, s = mpmath.cos(theta), mpmath.sin(theta)
-        big_g = s * (acos(mu) - s * mu) + mpf(2) / 3 * (s / mu * (1 - s**3) - s)
-        return a + r * a / pi * big_g
-
-    s = mpmath.sin(g.theta_i) * mpmath.sin(g.theta_r) * mpmath.cos(g.dphi)
-    t = max(g.mu_i, g.mu_r) if s > 0 else 1
-    single = albedo / pi * a * (1 + r * s / t)
-    if r == 0:
-        return single
-    again = albedo**2 * mean / (1 - albedo * (1 - mean))
-    return single + again / pi * (1 - e(g.theta_i)) * (1 - e(g.theta_r)) / (1 - mean)
-
-
-def test_at_forty_digits() -> None:
-    sets = [{"albedo": rho, "roughness": r} for r in ROUGHNESSES for rho in (0.0, 0.6, 1.0)]
-    assert compare("eon", eon, sets, thin=2, digits=60) <= 1e-12
-
-
-@pytest.mark.parametrize("roughness", ROUGHNESSES)
+@pytest.mark.parametrize("roughness", [0.0, 1e-12, 1e-8, 0.3, 1.0])
 def test_nothing_is_lost_at_albedo_one(roughness: float) -> None:
     for theta in (0.0, 0.5, 1.2, math.radians(89.9)):
         got = gonio.directional_albedo(make("eon", albedo=1.0, roughness=roughness), theta, rtol=1e-10)
@@ -54,16 +25,6 @@ def test_nothing_is_lost_at_albedo_one(roughness: float) -> None:
 def test_lambert_at_roughness_zero() -> None:
     at = (np.array([0.2, 1.0, 1.5]), 0.4, 0.9, np.array([0.1, 2.0, 3.5]))
     assert make("eon", albedo=0.6, roughness=0.0).f_r(*at) == pytest.approx(0.6 / math.pi, rel=1e-15)
-
-
-@settings(max_examples=100, deadline=None)
-@given(parameter_sets("eon"))
-def test_reciprocal_and_finite(parameters: dict[str, float]) -> None:
-    assert reciprocity(make("eon", **parameters), count=200) <= 1e-13
-
-
-def test_refusals() -> None:
-    check_refusals("eon", {"albedo": 0.5, "roughness": 0.3})
 
 
 def test_arctangent() -> None:

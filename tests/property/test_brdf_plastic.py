@@ -1,4 +1,4 @@
-"""Diffuse base below a smooth surface: 40 digits, constants of diffuse light, nothing lost with the gloss, refusals."""
+"""Diffuse base below a smooth surface: constants of diffuse light, nothing lost with the gloss."""
 
 from __future__ import annotations
 
@@ -7,41 +7,15 @@ import math
 
 import mpmath
 import pytest
-from hypothesis import given, settings
-from mpmath import asin, log, mpf, pi, sin, tan
+from mpmath import mpf, sin
 
 import gonio
 from gonio.brdf.plastic import diffuse_reflectance
-from tests.brdf_truth import Geometry, check_refusals, compare, largest_albedo, parameter_sets, reciprocity
+from tests.brdf_formulas import external, fresnel
+from tests.brdf_truth import largest_albedo
 
 make = gonio.brdf.make
 INDICES = (1.0, 1.0 + 1e-12, 1.0001, 1.05, 1.5, 3.0)
-
-
-def fresnel(theta: mpf, n: mpf) -> mpf:
-    """Fresnel's sine and tangent laws for unpolarised light; n < 1 is a look from within."""
-    if n == 1 or sin(theta) >= n:
-        return mpf(0) if n == 1 else mpf(1)
-    if theta < mpf("1e-18"):
-        return ((n - 1) / (n + 1)) ** 2
-    t = asin(sin(theta) / n)
-    return ((sin(theta - t) / sin(theta + t)) ** 2 + (tan(theta - t) / tan(theta + t)) ** 2) / 2
-
-
-def external(n: mpf) -> mpf:
-    """Mean of F for diffuse light from outside in closed form: Duntley 1942 (after Walsh)."""
-    if n == 1:
-        return mpf(0)
-    with mpmath.workdps(90):
-        n2, n4 = n**2, n**4
-        value = (
-            mpf(1) / 2
-            + (n - 1) * (3 * n + 1) / (6 * (n + 1) ** 2)
-            + n2 * (n2 - 1) ** 2 / (n2 + 1) ** 3 * log((n - 1) / (n + 1))
-            - 2 * n**3 * (n2 + 2 * n - 1) / ((n2 + 1) * (n4 - 1))
-            + 8 * n4 * (n4 + 1) / ((n2 + 1) * (n4 - 1) ** 2) * log(n)
-        )
-    return +value
 
 
 @functools.cache
@@ -52,17 +26,6 @@ def internal(n: mpf) -> mpf:
     # d(sin^2 inside) = d(sin^2 outside) / n^2; beyond the critical angle F = 1
     ends = [0, 0.5, 1, 1.3, 1.45, 1.53, 1.56, 1.568, mpmath.pi / 2]
     return 1 - mpmath.quad(lambda t: (1 - fresnel(t, n)) * sin(2 * t), ends) / n**2
-
-
-def plastic(g: Geometry, albedo: mpf, n: mpf) -> mpf:
-    through = (1 - fresnel(g.theta_i, n)) * (1 - fresnel(g.theta_r, n))
-    inside = 1 - (1 - external(n)) / n**2
-    return albedo / pi * through / (n**2 * (1 - albedo * inside))
-
-
-def test_at_forty_digits() -> None:
-    sets = [{"albedo": rho, "n": n} for n in INDICES for rho in (0.0, 0.6, 1.0)]
-    assert compare("plastic", plastic, sets, thin=3) <= 1e-12
 
 
 @pytest.mark.parametrize("n", [*INDICES, 1.0 + 1e-7, 1.01, 1.3, 2.0])
@@ -94,13 +57,3 @@ def test_with_its_gloss_nothing_is_lost(n: float) -> None:
         assert abs(float(got.value) - truth) <= float(got.error) + 1e-14 * truth
         assert float(got.error) <= 1e-9 * truth
     assert largest_albedo(make("plastic", albedo=1.0, n=n)) <= 1.0
-
-
-@settings(max_examples=100, deadline=None)
-@given(parameter_sets("plastic"))
-def test_reciprocal_and_finite(parameters: dict[str, float]) -> None:
-    assert reciprocity(make("plastic", **parameters), count=200) <= 1e-13
-
-
-def test_refusals() -> None:
-    check_refusals("plastic", {"albedo": 0.5, "n": 1.5})
