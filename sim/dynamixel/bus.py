@@ -4,9 +4,8 @@ The bus finds the servo that a packet is for, lets it execute the instruction an
 port and no clock: the caller says when the bytes arrived and delivers the replies. `sim.links` does that for a
 pseudo-terminal, a TCP socket and an in-process port.
 
-Not modelled: two servos with one ID answering over each other, Protocol 1.0, control table backup (answered as an
-unknown instruction, as firmware without it does). Delays hold the servos' Return Delay Time; what the bytes need on the
-wire is the link's business.
+Not modelled: two servos with one ID answering over each other, Protocol 1.0. Delays hold the servos' Return Delay Time;
+what the bytes need on the wire is the link's business.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from sim.dynamixel.control_table import BAUD_RATES
-from sim.dynamixel.faults import Fault
+from sim.dynamixel.faults import OF_REPLIES, OF_THE_SERVO, Fault
 from sim.dynamixel.packet import (
     ALERT,
     BROADCAST,
@@ -33,6 +32,7 @@ from sim.dynamixel.servo import Refused, Servo
 Reply = tuple[float, bytes]  # seconds after the instruction's last byte, and the bytes
 
 _LEVEL_READ, _LEVEL_ALL = 1, 2
+_RESETS_ALL_BEFORE = 42  # firmware that obeys a factory reset of everything by broadcast
 
 
 @dataclass
@@ -76,7 +76,7 @@ class DynamixelBus:
         """Add a fault; its counts run from when the bus was made."""
         self._faults.append(fault)
         for servo in self.servos:
-            if fault.kind in ("hardware", "stuck") and fault.concerns(servo.id):
+            if fault.kind in OF_THE_SERVO and fault.concerns(servo.id):
                 servo.schedule(fault)
 
     def servo(self, id: int) -> Servo:
@@ -151,16 +151,12 @@ class DynamixelBus:
         """Put a reply on the line, unless a fault spoils it."""
         counts = self._counts[servo]
         counts.replies += 1
+        sent = [data]
         for fault in self._faults:
-            if not fault.concerns(servo.id) or not fault.due_at(fault.at_reply, counts.replies):
-                continue
-            if fault.kind == "drop":
-                return []
-            if fault.kind == "corrupt":
-                data = data[:-3] + bytes((data[-3] ^ 0x01,)) + data[-2:]
-            elif fault.kind == "delay":
+            if fault.kind in OF_REPLIES and fault.concerns(servo.id) and fault.due_at(fault.at_reply, counts.replies):
+                sent = [spoilt for reply in sent for spoilt in fault.spoil(reply, counts.replies)]
                 delay += fault.delay_s
-        return [(delay, data)]
+        return [(delay, reply) for reply in sent if reply]
 
     # ---- instructions ------------------------------------------------------------------------------------------
 
@@ -246,6 +242,8 @@ class DynamixelBus:
             servo.action(t)
         elif packet.instruction == Instruction.CLEAR:
             servo.clear(params, t)
+        elif packet.instruction == Instruction.BACKUP:
+            servo.back_up(params, t)
         elif packet.instruction == Instruction.FACTORY_RESET:
             raise Refused(ErrorNumber.DATA_RANGE)
         else:
@@ -268,15 +266,16 @@ class DynamixelBus:
                 replies += self._send(servo, delay, self._status(servo, 0, self._identity(servo)))
             elif packet.instruction == Instruction.REBOOT:
                 servo.reboot(t)
-            elif packet.instruction == Instruction.FACTORY_RESET and packet.params in (b"\x01", b"\x02"):
-                servo.factory_reset(packet.params[0], t)
+            elif packet.instruction == Instruction.FACTORY_RESET and packet.params in (b"\x01", b"\x02", b"\xff"):
+                if packet.params != b"\xff" or servo.firmware < _RESETS_ALL_BEFORE:
+                    servo.factory_reset(packet.params[0], t)
             elif packet.instruction != Instruction.READ:
                 self._quietly(lambda servo=servo: self._command(servo, packet, t))  # type: ignore[misc]
         return replies
 
     @staticmethod
     def _identity(servo: Servo) -> bytes:
-        return servo.model.number.to_bytes(2, "little") + bytes((servo.model.firmware,))
+        return servo.model.number.to_bytes(2, "little") + bytes((servo.firmware,))
 
     @staticmethod
     def _quietly(command: Callable[[], None]) -> None:
@@ -338,7 +337,7 @@ class DynamixelBus:
             if id not in hearing:
                 break
             servo = self.servo(id)
-            if servo.status_return_level < _LEVEL_READ or servo.model.firmware < servo.model.fast_read_firmware:
+            if servo.status_return_level < _LEVEL_READ or not servo.reads_fast:
                 break
             error, data = self._read_part(servo, address, length, t)
             # The place of every part is fixed by the request, so a servo that cannot read fills its own with zeros.

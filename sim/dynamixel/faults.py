@@ -6,13 +6,20 @@ rig time; it never depends on chance, so a failing test fails again.
 
 from __future__ import annotations
 
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
 from gonio.errors import ConfigurationError
+from sim.dynamixel.packet import crc16
 
-Kind = Literal["silent", "hardware", "stuck", "error", "drop", "corrupt", "delay"]
+Kind = Literal[
+    "silent", "hardware", "stuck", "obstacle", "reboot",
+    "error", "drop", "truncate", "corrupt", "duplicate", "delay", "wrong_id",
+]  # fmt: skip
+OF_THE_SERVO = ("hardware", "stuck", "obstacle", "reboot")  # the servo keeps their time itself
+OF_REPLIES = ("drop", "truncate", "corrupt", "duplicate", "delay", "wrong_id")
 
 OVERLOAD = 0x20  # bit 5 of Hardware Error Status
 OVERHEATING = 0x04  # bit 2
@@ -20,12 +27,9 @@ INPUT_VOLTAGE = 0x01  # bit 0
 
 _TRIGGERS: Mapping[str, tuple[str, ...]] = {
     "silent": ("at_instruction", "at_goal_write", "at_time_s"),
-    "hardware": ("at_goal_write", "at_time_s"),
-    "stuck": ("at_goal_write", "at_time_s"),
     "error": ("at_instruction",),
-    "drop": ("at_reply",),
-    "corrupt": ("at_reply",),
-    "delay": ("at_reply",),
+    **dict.fromkeys(OF_THE_SERVO, ("at_goal_write", "at_time_s")),
+    **dict.fromkeys(OF_REPLIES, ("at_reply",)),
 }
 
 
@@ -38,9 +42,15 @@ class Fault:
     kind : str
         ``"silent"``: the servo neither hears nor answers from then on, as if unplugged.
         ``"hardware"``: `bits` of Hardware Error Status come on; if Shutdown has one of them, torque goes off.
-        ``"stuck"``: the shaft stands still from then on; its profile runs as if nothing were wrong.
+        ``"stuck"``: the shaft stands still from then on; its profile runs as if nothing were wrong, and the overload
+        protection does not notice.
+        ``"obstacle"``: `ahead_counts` ahead of the shaft, in the direction in which it moves, it can go no further; the
+        motor pushes until the overload protection cuts in.
+        ``"reboot"``: the servo restarts, as after a brown-out.
         ``"error"``: the servo answers with error `number` and does not do what it was told.
-        ``"drop"``, ``"corrupt"``, ``"delay"``: a reply is lost, has a wrong bit, or comes `delay_s` late.
+        ``"drop"``, ``"truncate"``, ``"corrupt"``, ``"duplicate"``, ``"delay"``, ``"wrong_id"``: a reply is lost, ends
+        `lost_bytes` early, has `flips` wrong bits, comes twice, comes `delay_s` late, or bears the next servo's ID (with
+        a right checksum).
     servo_id : int, optional
         Whom; None for every servo.
     at_instruction, at_goal_write, at_reply : int, optional
@@ -60,6 +70,14 @@ class Fault:
         For ``"error"``: 1 to 7.
     delay_s : float, optional
         For ``"delay"`` [s].
+    flips : int, optional
+        For ``"corrupt"``: how many bits; one is the lowest of the last data byte, several are anywhere.
+    burst : bool, optional
+        For ``"corrupt"``: the bits stand side by side.
+    lost_bytes : int, optional
+        For ``"truncate"``.
+    ahead_counts : float, optional
+        For ``"obstacle"`` [counts].
     """
 
     kind: Kind
@@ -74,6 +92,10 @@ class Fault:
     bits: int = OVERLOAD
     number: int = 1
     delay_s: float = 0.0
+    flips: int = 1
+    burst: bool = False
+    lost_bytes: int = 2
+    ahead_counts: float = 50.0
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
@@ -82,6 +104,8 @@ class Fault:
         if len(given) != 1 or given[0] not in _TRIGGERS[self.kind]:
             wanted = " or ".join(_TRIGGERS[self.kind])
             raise ConfigurationError(f"A fault of kind {self.kind!r} needs {wanted}, and has {given or 'neither'}.")
+        if self.flips < 1 or self.lost_bytes < 1 or not self.ahead_counts > 0.0:
+            raise ConfigurationError(f"A fault of kind {self.kind!r} needs flips, lost_bytes and ahead_counts above 0.")
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Fault:
@@ -102,6 +126,35 @@ class Fault:
     def concerns(self, servo_id: int) -> bool:
         """Whether it is about this servo."""
         return self.servo_id is None or self.servo_id == servo_id
+
+    def spoil(self, reply: bytes, count: int) -> list[bytes]:
+        """What arrives of the `count`-th reply, for the kinds that change its bytes."""
+        if self.kind == "drop":
+            return []
+        if self.kind == "duplicate":
+            return [reply, reply]
+        if self.kind == "truncate":
+            return [reply[: max(len(reply) - self.lost_bytes, 0)]]
+        if self.kind == "wrong_id":
+            head = reply[:4] + bytes(((reply[4] + 1) % 253,)) + reply[5:-2]
+            return [head + crc16(head).to_bytes(2, "little")]
+        if self.kind == "corrupt":
+            return [self._flip(reply, count)]
+        return [reply]
+
+    def _flip(self, reply: bytes, count: int) -> bytes:
+        if self.flips == 1:
+            places = [8 * (len(reply) - 3)]
+        else:
+            rng = random.Random(f"{self.servo_id}:{count}")
+            bits = 8 * len(reply)
+            flips = min(self.flips, bits)
+            start = rng.randrange(bits - flips + 1)
+            places = list(range(start, start + flips)) if self.burst else rng.sample(range(bits), flips)
+        spoilt = bytearray(reply)
+        for place in places:
+            spoilt[place // 8] ^= 1 << place % 8
+        return bytes(spoilt)
 
     def due_at(self, trigger: int | None, count: int) -> bool:
         """Whether the `count`-th event is one that the fault strikes."""

@@ -46,6 +46,8 @@ class Motion:
     shape : str
         Of its speed over time.
     segments : tuple of Segment
+    final_velocity : float
+        With which it goes on when its profile is over [counts/s].
     """
 
     start: float
@@ -53,16 +55,22 @@ class Motion:
     duration: float
     shape: Shape
     segments: tuple[Segment, ...]
+    final_velocity: float = 0.0
+
+    @property
+    def end(self) -> float:
+        """When its profile is over [s]."""
+        return self.start + self.duration
 
     def done(self, time: float) -> bool:
-        """Whether it is over."""
+        """Whether its profile is over."""
         return time - self.start >= self.duration
 
     def at(self, time: float) -> tuple[float, float]:
         """Position [counts] and speed [counts/s] at `time` [s]."""
         elapsed = max(time - self.start, 0.0)
         if elapsed >= self.duration:
-            return self.goal, 0.0
+            return self.goal + self.final_velocity * (elapsed - self.duration), self.final_velocity
         segment = self.segments[0]
         for candidate in self.segments[1:]:
             if candidate.start > elapsed:
@@ -88,6 +96,36 @@ class Motion:
 def rest(time: float, position: float) -> Motion:
     """Standing still at `position` [counts] since `time` [s]."""
     return Motion(time, position, 0.0, "step", ())
+
+
+def spin(time: float, position: float, velocity: float, wanted: float, acceleration: float) -> Motion:
+    """Change the speed from `velocity` to `wanted` [counts/s] at `acceleration` (may be infinite), and keep it."""
+    if math.isinf(acceleration) or velocity == wanted:
+        return Motion(time, position, 0.0, "step", (), wanted)
+    duration = abs(wanted - velocity) / acceleration
+    ramp = Segment(0.0, position, velocity, math.copysign(acceleration, wanted - velocity))
+    return Motion(time, position + 0.5 * (velocity + wanted) * duration, duration, "trapezoid", (ramp,), wanted)
+
+
+def limits_of_times(distance: float, total: float, rising: float) -> tuple[float, float]:
+    """Speed [counts/s] and acceleration [counts/s^2] of a time-based profile; both may be infinite.
+
+    Parameters
+    ----------
+    distance : float
+        From rest to rest [counts].
+    total, rising : float
+        The manual's t3 and t1 [s]; t1 counts as at most half of t3. 0 for an infinite speed or acceleration.
+
+    Notes
+    -----
+    A trapezoid of speed v covers v (t3 - t1), and a = v / t1.
+    """
+    rising = min(rising, 0.5 * total)
+    if total <= 0.0 or distance == 0.0:
+        return math.inf, math.inf
+    speed = abs(distance) / (total - rising)
+    return speed, speed / rising if rising > 0.0 else math.inf
 
 
 def stopping_point(position: float, velocity: float, acceleration: float) -> float:

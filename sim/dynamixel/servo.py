@@ -1,12 +1,11 @@
-"""One X-series servo: control table, firmware behaviour, and a shaft that moves.
+"""One X-series servo: the firmware's behaviour between a control table and a motor.
 
 Nothing ticks: every question is answered for the time at which it is asked, from profiles in closed form. The encoder
 reports whole counts of a shaft that comes to rest between them, and `Servo.output_counts` says where the link is that
-the shaft drives (see `sim.dynamixel.shaft`).
+the shaft drives (see `sim.dynamixel.shaft`); what the motor feels is in `sim.dynamixel.drive`.
 
-Not modelled: velocity, current and PWM modes; reverse, time-based profiles and torque-on-by-goal; ringing at the end
-of a move; gravity (the shaft stays when torque goes off); the time that a reboot takes; current and temperature beyond
-a plausible reading. Registers of what is not modelled refuse values other than the default with a Data Range error.
+Not modelled: the time that a reboot takes, RC protocols, the gains' dynamics (the proportional gain says how far a load
+pulls the shaft from its goal, an integral gain that it does not), the LED's blinking.
 
 References
 ----------
@@ -17,28 +16,30 @@ https://emanual.robotis.com/docs/en/dxl/protocol2/
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from sim.dynamixel import motion
 from sim.dynamixel.control_table import XM430_W350, Model, Register
-from sim.dynamixel.faults import Fault
+from sim.dynamixel.drive import Drive
+from sim.dynamixel.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD, Fault
+from sim.dynamixel.load import Load
+from sim.dynamixel.memory import Memory, Refused
 from sim.dynamixel.motion import ACCELERATION_UNIT, COUNTS_PER_TURN, VELOCITY_UNIT
 from sim.dynamixel.packet import ErrorNumber
-from sim.dynamixel.shaft import Shaft
+
+__all__ = ["Refused", "Servo"]
 
 IN_POSITION_COUNTS = 16  # "smaller than a predefined value", the manual says; it does not say which
 FOLLOWING_ERROR_COUNTS = 64  # as little known
 WATCHDOG_UNIT_S = 0.020
+FULL_PWM = 885
 
+CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16  # operating modes
+_REVERSE, _TIME_BASED, _TORQUE_BY_GOAL = 1, 4, 8  # bits of Drive Mode
+_TIME_BASED_FIRMWARE = 42
+_GOAL_OF_MODE = {CURRENT: 102, VELOCITY: 104, POSITION: 116, EXTENDED: 116, CURRENT_POSITION: 116, PWM: 100}
 _SHAPE_BITS = {"step": 0, "rectangle": 1, "triangle": 2, "trapezoid": 3}
-_GOALS = frozenset((100, 102, 104, 116))  # read-only while a bus watchdog error is active
-
-
-class Refused(Exception):
-    """Not an error of ours: the servo answers with an error number."""
-
-    def __init__(self, number: ErrorNumber) -> None:
-        super().__init__(number.name)
-        self.number = number
+_GAINS = ("Position D Gain", "Position I Gain", "Position P Gain", "Velocity I Gain", "Velocity P Gain")
 
 
 class Servo:
@@ -55,10 +56,19 @@ class Servo:
         Play between shaft and link, from flank to flank [counts]; 0.25 degrees by default.
     friction_counts : tuple of float, optional
         Smallest and largest distance from the goal at which friction stops the shaft [counts].
+    harmonics : sequence of tuple of float, optional
+        Errors of the encoder: (n, amplitude [counts], phase [rad]) of each wave; the shaft's true place is
+        ``e + sum(amplitude sin(n 2 pi e / 4096 + phase))`` where the encoder says e.
+    load : Load, optional
+        Weight of the joint.
+    supply_v : float, optional
+        Voltage of the supply [V]; the model's nominal one by default.
     seed : int, optional
         Of the friction.
     baud_code : int, optional
         Baud Rate register as a previous user left it; 3 is 1 Mbit/s, the factory's 1 is 57.6 kbit/s.
+    firmware : int, optional
+        Version; the model's by default. Older ones lack what the manual dates.
     """
 
     def __init__(
@@ -69,29 +79,34 @@ class Servo:
         initial_counts: float = 2048.0,
         backlash_counts: float = 0.25 / 360.0 * COUNTS_PER_TURN,
         friction_counts: tuple[float, float] = (0.2, 3.0),
+        harmonics: tuple[tuple[int, float, float], ...] = (),
+        load: Load | None = None,
+        supply_v: float | None = None,
         seed: int = 0,
         baud_code: int = 3,
+        firmware: int | None = None,
     ) -> None:
         self.model = model
-        self._memory = bytearray(model.size)
-        self._shaft = Shaft(
+        self.firmware = model.firmware if firmware is None else firmware
+        self._memory = Memory(model, self.firmware)
+        self._drive = Drive(
+            model.motor,
             initial_counts,
-            fastest=model.no_load_speed / 60.0 * COUNTS_PER_TURN,
             backlash=backlash_counts,
             friction=friction_counts,
+            load=load or Load(),
+            supply_v=model.motor.voltage_v if supply_v is None else supply_v,
             seed=f"{seed}:{id}",
         )
-        self._trajectory = motion.rest(0.0, initial_counts)
+        self._harmonics = tuple(harmonics)
         self._fold = 0  # counts that make Present Position start within one turn
         self._goal_pending = False  # a goal was written while torque was off
         self._registered: tuple[int, bytes] | None = None
         self._last_instruction = 0.0
         self._goal_writes = 0
         self._faults: list[tuple[Fault, float | None]] = []
-        for register in model.registers:
-            self._poke(register, register.default)
-        self._poke(model.by_name["ID"], id)
-        self._poke(model.by_name["Baud Rate"], baud_code)
+        self._memory["ID"] = id
+        self._memory["Baud Rate"] = baud_code
         self._start_ram(0.0)
 
     # ---- what the world and the bus ask ------------------------------------------------------------------------
@@ -99,37 +114,42 @@ class Servo:
     @property
     def id(self) -> int:
         """Register 7."""
-        return self._memory[7]
+        return self._memory["ID"]
 
     @property
     def shadow_id(self) -> int:
         """Register 12; 253 and above is none."""
-        return self._memory[12]
+        return self._memory["Secondary(Shadow) ID"]
 
     @property
     def baud_code(self) -> int:
         """Register 8."""
-        return self._memory[8]
+        return self._memory["Baud Rate"]
 
     @property
     def status_return_level(self) -> int:
         """Register 68."""
-        return self._memory[68]
+        return self._memory["Status Return Level"]
 
     @property
     def return_delay_s(self) -> float:
         """Register 9 [s]."""
-        return self._memory[9] * 2e-6
+        return self._memory["Return Delay Time"] * 2e-6
 
     @property
     def alert(self) -> bool:
         """Hardware Error Status is not zero."""
-        return self._memory[70] != 0
+        return self._memory["Hardware Error Status"] != 0
 
     @property
     def torque(self) -> bool:
         """Register 64."""
-        return self._memory[64] != 0
+        return self._memory["Torque Enable"] != 0
+
+    @property
+    def reads_fast(self) -> bool:
+        """Whether the firmware knows fast reads, the backup and what came with them."""
+        return self.firmware >= self.model.newer_firmware
 
     @property
     def goal_writes(self) -> int:
@@ -137,36 +157,31 @@ class Servo:
         return self._goal_writes
 
     def shaft_counts(self, t: float) -> float:
-        """Where the shaft is, before the encoder rounds and without homing offset [counts]."""
+        """What the encoder sees, before it rounds and without homing offset [counts]."""
         self.advance(t)
-        return self._shaft.at(t)[0]
+        return self._drive.shaft.at(t)[0]
 
     def output_counts(self, t: float) -> float:
-        """Where the link is [counts].
+        """Where the link is [counts], also at a time that has passed.
 
         After an increasing approach longer than the play it is ``shaft - backlash / 2``, after a decreasing one
-        ``shaft + backlash / 2``.
+        ``shaft + backlash / 2``; the encoder's harmonics come on top.
         """
         self.advance(t)
-        return self._shaft.link(t)
+        link = self._drive.shaft.link(t)
+        turn = 2.0 * math.pi * link / COUNTS_PER_TURN
+        return link + sum(amplitude * math.sin(n * turn + phase) for n, amplitude, phase in self._harmonics)
 
     def advance(self, t: float) -> None:
-        """Let everything happen that was due by `t` [s]: scheduled faults and the bus watchdog."""
-        for fault, moment in list(self._faults):
-            if moment is not None and t >= moment:
-                self._faults.remove((fault, moment))
-                self._strike(fault, moment)
-        watchdog = self._peek("Bus Watchdog")
-        if watchdog > 0 and self.torque:
-            due = self._last_instruction + watchdog * WATCHDOG_UNIT_S
-            if t > due:
-                self._halt(due)
-                self._poke(self.model.by_name["Bus Watchdog"], -1)
-                self._poke(self.model.by_name["Profile Acceleration"], 0)
-                self._poke(self.model.by_name["Profile Velocity"], 0)
+        """Let everything happen that was due by `t` [s], in order: faults, watchdog, overload, heat."""
+        while True:
+            moment, act = min(self._due(), key=lambda event: event[0], default=(math.inf, None))
+            if act is None or moment > t:
+                return
+            act(moment)
 
     def schedule(self, fault: Fault) -> None:
-        """Have a ``"hardware"`` or ``"stuck"`` fault happen at its time or goal write."""
+        """Have a fault of the servo itself happen at its time or goal write."""
         self._faults.append((fault, fault.at_time_s))
 
     def heard(self, t: float) -> None:
@@ -185,13 +200,8 @@ class Servo:
             Access, if a byte is not defined; Data Length, if none is asked for.
         """
         self.advance(t)
-        if length < 1:
-            raise Refused(ErrorNumber.DATA_LENGTH)
         self._refresh(t)
-        where = [self._resolve(a) for a in range(address, address + length)]
-        if any(a not in self.model.covering for a in where):
-            raise Refused(ErrorNumber.ACCESS)
-        return bytes(self._memory[a] for a in where)
+        return self._memory.read(address, length)
 
     def write(self, address: int, data: bytes, t: float, *, eeprom: bool = True) -> None:
         """Write `data` at `address`, all or nothing.
@@ -199,18 +209,18 @@ class Servo:
         Raises
         ------
         Refused
-            Access, Data Length, Data Range or Data Limit.
+            Access, Data Length, Data Range or Data Limit; Result Fail for torque after a shutdown.
         """
         self.advance(t)
-        for register, value in self._items(address, data, eeprom):
+        for register, value in self._checked(address, data, eeprom):
             self._apply(register, value, t)
 
     def reg_write(self, address: int, data: bytes, t: float) -> None:
         """Check a write and keep it for `action`; a second one replaces the first."""
         self.advance(t)
-        self._items(address, data, True)
+        self._checked(address, data, True)
         self._registered = (address, data)
-        self._memory[69] = 1
+        self._memory["Registered Instruction"] = 1
 
     def action(self, t: float) -> None:
         """Execute the registered write.
@@ -223,14 +233,19 @@ class Servo:
         if self._registered is None:
             raise Refused(ErrorNumber.INSTRUCTION)
         (address, data), self._registered = self._registered, None
-        self._memory[69] = 0
+        self._memory["Registered Instruction"] = 0
         self.write(address, data, t)
 
     def reboot(self, t: float) -> None:
-        """Restart: RAM to defaults, torque off, hardware errors cleared, turns forgotten."""
-        self.advance(t)
-        self._halt(t)
+        """Restart: RAM to defaults, torque off, hardware errors cleared, turns forgotten; then as configured."""
+        self._drive.release(t)
         self._start_ram(t)
+        startup = self._memory["Startup Configuration"] if self.reads_fast else 0
+        if startup & 2:
+            self._memory.restore(eeprom=False)
+        if startup & 1:
+            self._memory["Torque Enable"] = 1
+            self._torque_on(t)
 
     def factory_reset(self, option: int, t: float) -> None:
         """Defaults everywhere; 0x01 keeps the ID, 0x02 keeps ID and baud rate.
@@ -244,8 +259,8 @@ class Servo:
             raise Refused(ErrorNumber.DATA_RANGE)
         kept = {0xFF: (), 0x01: (7,), 0x02: (7, 8)}[option]
         for register in self.model.registers:
-            if register.eeprom and register.address not in kept:
-                self._poke(register, register.default)
+            if register.eeprom and register.writable and register.address not in kept:
+                self._memory.poke(register, register.default)
         self.reboot(t)
 
     def clear(self, params: bytes, t: float) -> None:
@@ -259,173 +274,196 @@ class Servo:
         self.advance(t)
         if params != b"\x01\x44\x58\x4c\x22":
             raise Refused(ErrorNumber.DATA_RANGE)
-        if not self._shaft.done(t):
+        if not self._drive.shaft.done(t):
             raise Refused(ErrorNumber.RESULT_FAIL)
         self._fold_position(t)
 
+    def back_up(self, params: bytes, t: float) -> None:
+        """Keep the control table, or bring back the EEPROM that was kept.
+
+        Raises
+        ------
+        Refused
+            Instruction, by older firmware; Data Range, if `params` are not the manual's; Result Fail, while torque is
+            on or without a backup.
+        """
+        self.advance(t)
+        if not self.reads_fast:
+            raise Refused(ErrorNumber.INSTRUCTION)
+        if params not in (b"\x01CTRL", b"\x02CTRL"):
+            raise Refused(ErrorNumber.DATA_RANGE)
+        restore = params[0] == 2
+        if self.torque or (restore and not self._memory.backed_up):
+            raise Refused(ErrorNumber.RESULT_FAIL)
+        if restore:
+            self._memory.restore(eeprom=True)
+            self._fold_position(t)
+        else:
+            self._memory.back_up()
+
     # ---- registers ---------------------------------------------------------------------------------------------
 
-    def _peek(self, name: str) -> int:
-        register = self.model.by_name[name]
-        raw = self._memory[register.address : register.address + register.size]
-        return int.from_bytes(raw, "little", signed=register.signed)
-
-    def _poke(self, register: Register, value: int) -> None:
-        end = register.address + register.size
-        mask = (1 << 8 * register.size) - 1
-        self._memory[register.address : end] = (value & mask).to_bytes(register.size, "little")
-
-    def _set(self, name: str, value: int) -> None:
-        self._poke(self.model.by_name[name], value)
-
-    def _resolve(self, address: int) -> int:
-        """Follow an indirect address to the byte that it stands for."""
-        for block in self.model.indirect:
-            if block.data <= address < block.data + block.count:
-                slot = block.address + 2 * (address - block.data)
-                return int.from_bytes(self._memory[slot : slot + 2], "little")
-        return address
-
-    def _items(self, address: int, data: bytes, eeprom: bool) -> list[tuple[Register, int]]:
-        """Split a write into registers and values, and refuse it if one of them may not be written."""
-        if not data:
-            raise Refused(ErrorNumber.DATA_LENGTH)
-        where = [self._resolve(a) for a in range(address, address + len(data))]
-        items = []
-        k = 0
-        while k < len(data):
-            register = self.model.covering.get(where[k])
-            if register is None or not register.writable or (register.eeprom and (self.torque or not eeprom)):
-                raise Refused(ErrorNumber.ACCESS)
-            wanted = list(range(register.address, register.address + register.size))
-            if where[k : k + register.size] != wanted:
-                raise Refused(ErrorNumber.DATA_LENGTH)
-            value = int.from_bytes(data[k : k + register.size], "little", signed=register.signed)
+    def _checked(self, address: int, data: bytes, eeprom: bool) -> list[tuple[Register, int]]:
+        items = self._memory.items(address, data, eeprom=eeprom and not self.torque)
+        for register, value in items:
             self._check(register, value)
-            items.append((register, value))
-            k += register.size
         return items
 
     def _check(self, register: Register, value: int) -> None:
+        """Refuse a value that the register may not have, as things are."""
+        memory, address = self._memory, register.address
+        one_turn = address == 116 and memory["Operating Mode"] == POSITION
         if not register.lower <= value <= register.upper:
             # What lies outside the limits that the user set, and inside those of the table, is a Data Limit error.
-            limit = register.address == 116 and self._peek("Operating Mode") == 3
-            raise Refused(ErrorNumber.DATA_LIMIT if limit else ErrorNumber.DATA_RANGE)
-        if register.address in _GOALS and self._peek("Bus Watchdog") < 0:
+            raise Refused(ErrorNumber.DATA_LIMIT if one_turn else ErrorNumber.DATA_RANGE)
+        if address in _GOAL_OF_MODE.values() and memory["Bus Watchdog"] < 0:
             raise Refused(ErrorNumber.DATA_RANGE)
-        if register.address == 11 and value not in self.model.operating_modes:
+        if address == 11 and value not in self.model.operating_modes:
             raise Refused(ErrorNumber.DATA_RANGE)
-        if register.address == 64 and value == 1 and self._memory[70] & self._memory[63]:
+        if address == 10 and value & ~self._drive_mode_bits:
+            raise Refused(ErrorNumber.DATA_RANGE)
+        if address == 64 and value == 1 and memory["Hardware Error Status"] & memory["Shutdown"]:
             raise Refused(ErrorNumber.RESULT_FAIL)  # shut down; only a reboot restores torque
         lower, upper = register.lower, register.upper
-        if register.address == 116 and self._peek("Operating Mode") == 3:
-            lower, upper = self._peek("Min Position Limit"), self._peek("Max Position Limit")
-        elif register.address == 104:
-            lower, upper = -self._peek("Velocity Limit"), self._peek("Velocity Limit")
-        elif register.address == 102:
-            lower, upper = -self._peek("Current Limit"), self._peek("Current Limit")
-        elif register.address == 100:
-            lower, upper = -self._peek("PWM Limit"), self._peek("PWM Limit")
+        if one_turn:
+            lower, upper = memory["Min Position Limit"], memory["Max Position Limit"]
+        elif address in (100, 102, 104):
+            upper = memory[{100: "PWM Limit", 102: "Current Limit", 104: "Velocity Limit"}[address]]
+            lower = -upper
         if not lower <= value <= upper:
             raise Refused(ErrorNumber.DATA_LIMIT)
 
+    @property
+    def _drive_mode_bits(self) -> int:
+        bits = _REVERSE
+        if self.firmware >= _TIME_BASED_FIRMWARE:
+            bits |= _TIME_BASED
+        return bits | (_TORQUE_BY_GOAL if self.reads_fast else 0)
+
     def _apply(self, register: Register, value: int, t: float) -> None:
-        before = self._peek(register.name)
-        self._poke(register, value)
+        before = self._memory.value(register)
+        self._memory.poke(register, value)
         if register.address == 116:
             self._goal_written(t)
+        elif register.address in (100, 102, 104) and self.torque:
+            if register.address == _GOAL_OF_MODE[self._memory["Operating Mode"]]:
+                self._go(t)
         elif register.address == 64 and value != before:
             if value:
                 self._torque_on(t)
             else:
-                self._halt(t)
+                self._drive.release(t)
+                self._goal_pending = False
+        elif register.address == 10 and value != before:
+            self._fold_position(t)
         elif register.address == 11 and value != before:
-            if value == 3:
+            if value == POSITION:
                 self._fold_position(t)
-            for name in ("Position D Gain", "Position I Gain", "Position P Gain", "Velocity I Gain", "Velocity P Gain"):
-                self._set(name, self.model.by_name[name].default)
-            self._set("Profile Acceleration", 0)
-            self._set("Profile Velocity", 0)
-            self._set("Goal PWM", self._peek("PWM Limit"))
+            for name in _GAINS:
+                self._memory[name] = self.model.by_name[name].default
+            self._memory["Profile Acceleration"] = 0
+            self._memory["Profile Velocity"] = 0
+            self._memory["Goal PWM"] = self._memory["PWM Limit"] if value != PWM else 0
+            if "Goal Current" in self._memory:
+                self._memory["Goal Current"] = self._memory["Current Limit"] if value != CURRENT else 0
 
     def _refresh(self, t: float) -> None:
         """Bring the registers that change by themselves up to date."""
-        position, velocity = self._shaft.at(t)
-        wanted, wanted_velocity = self._trajectory.at(t)
-        present = round(position - self._fold) + self._offset
-        following = round(wanted - self._fold) + self._offset
+        memory, drive = self._memory, self._drive
+        position, velocity = drive.shaft.at(t)
+        present = self._reading(position)
+        mode = memory["Operating Mode"]
         if not self.torque and not self._goal_pending:
-            self._set("Goal Position", present)
-        goal = self._peek("Goal Position")
-        ongoing = not self._trajectory.done(t)
-        speed = round(velocity / VELOCITY_UNIT)
-        status = int(self.torque and not ongoing and abs(goal - present) <= IN_POSITION_COUNTS)
-        status |= int(ongoing) << 1
-        status |= int(self.torque and abs(following - present) > FOLLOWING_ERROR_COUNTS) << 3
-        status |= _SHAPE_BITS[self._trajectory.shape] << 4
-        self._set("Realtime Tick", int(t * 1000.0) & 0x7FFF)
-        self._set("Moving", int(ongoing or abs(speed) > self._peek("Moving Threshold")))
-        self._set("Moving Status", status)
-        effort = 0
-        if self.torque:
-            pull = goal - present if not ongoing else (40 if wanted_velocity > 0 else -40)
-            effort = max(-400, min(400, pull if not self._shaft.stuck else 10 * (goal - present)))
-        self._set("Present PWM", effort)
-        self._set("Present Load" if "Present Load" in self.model.by_name else "Present Current", effort)
-        self._set("Present Velocity", speed)
-        self._set("Present Position", present)
-        self._set("Velocity Trajectory", round(wanted_velocity / VELOCITY_UNIT))
-        self._set("Position Trajectory", following)
-        self._set("Present Input Voltage", (self._peek("Max Voltage Limit") + self._peek("Min Voltage Limit")) // 2)
-        self._set("Present Temperature", 31)
+            memory["Goal Position"] = present
+        goal = memory["Goal Position"]
+        wanted, wanted_velocity = drive.trajectory.at(t)
+        ongoing, following, status = False, present, 0
+        if mode in (POSITION, EXTENDED, CURRENT_POSITION):
+            ongoing = not drive.trajectory.done(t)
+            following = self._reading(wanted)
+            status = int(self.torque and not ongoing and abs(goal - present) <= IN_POSITION_COUNTS)
+            status |= int(ongoing) << 1
+            status |= int(self.torque and abs(following - present) > FOLLOWING_ERROR_COUNTS) << 3
+        if mode not in (CURRENT, PWM):
+            status |= _SHAPE_BITS[drive.trajectory.shape] << 4
+        else:
+            wanted_velocity = 0.0
+        speed = self._sign * round(velocity / VELOCITY_UNIT)
+        memory["Realtime Tick"] = int(t * 1000.0) & 0x7FFF
+        memory["Moving"] = int(ongoing or abs(speed) > memory["Moving Threshold"])
+        memory["Moving Status"] = status
+        memory["Present PWM"] = self._sign * round(FULL_PWM * drive.effort(t))
+        unit = self.model.motor.current_unit_a
+        if unit is None:
+            memory["Present Load"] = self._sign * round(1000.0 * drive.torque(t) / self.model.motor.stall_torque_nm)
+        else:
+            memory["Present Current"] = self._sign * round(drive.current(t) / unit)
+        memory["Present Velocity"] = speed
+        memory["Present Position"] = present
+        memory["Velocity Trajectory"] = self._sign * round(wanted_velocity / VELOCITY_UNIT)
+        memory["Position Trajectory"] = following
+        memory["Present Input Voltage"] = round(10.0 * drive.voltage(t))
+        memory["Present Temperature"] = min(round(drive.heat.at(t)), 255)
+        memory["Backup Ready"] = int(memory.backed_up)
+
+    @property
+    def _sign(self) -> int:
+        """-1 in reverse mode."""
+        return -1 if self._memory["Drive Mode"] & _REVERSE else 1
 
     @property
     def _offset(self) -> int:
-        """Homing Offset, which position mode ignores beyond a quarter turn."""
-        offset = self._peek("Homing Offset")
-        return 0 if self._peek("Operating Mode") == 3 and abs(offset) > COUNTS_PER_TURN // 4 else offset
+        """Homing Offset, which position mode ignores beyond a quarter turn, and reverse mode does not turn."""
+        offset = self._memory["Homing Offset"]
+        beyond = self._memory["Operating Mode"] == POSITION and abs(offset) > COUNTS_PER_TURN // 4
+        return 0 if beyond else offset
+
+    def _reading(self, raw: float) -> int:
+        """Encoder counts as the registers have them."""
+        return round(self._sign * raw - self._fold) + self._offset
 
     # ---- motion ------------------------------------------------------------------------------------------------
 
     def _start_ram(self, t: float) -> None:
         for register in self.model.registers:
             if not register.eeprom:
-                self._poke(register, register.default)
+                self._memory.poke(register, register.default)
         self._goal_pending = False
         self._registered = None
         self._last_instruction = t
-        self._set("Goal PWM", self._peek("PWM Limit"))
-        if "Goal Current" in self.model.by_name:
-            self._set("Goal Current", self._peek("Current Limit"))
+        mode = self._memory["Operating Mode"]
+        self._memory["Goal PWM"] = self._memory["PWM Limit"] if mode != PWM else 0
+        if "Goal Current" in self._memory:
+            self._memory["Goal Current"] = self._memory["Current Limit"] if mode != CURRENT else 0
         self._fold_position(t)
 
     def _fold_position(self, t: float) -> None:
         """Make Present Position start within one turn; the shaft does not move."""
-        position = self._shaft.at(t)[0]
+        position = self._sign * self._drive.shaft.at(t)[0]
         self._fold = COUNTS_PER_TURN * (round(position) // COUNTS_PER_TURN)
 
     def _torque_on(self, t: float) -> None:
         """Hold the present position, unless a goal was written while torque was off: that one is then executed."""
-        if self._peek("Operating Mode") == 3:
+        mode = self._memory["Operating Mode"]
+        if mode == POSITION:
             self._fold_position(t)
-        if self._goal_pending:
-            self._go(t)
+        if not self._goal_pending and _GOAL_OF_MODE[mode] == 116:
+            here = self._drive.shaft.at(t)[0]
+            self._memory["Goal Position"] = self._reading(here)
+            self._drive.hold(t)
+            self._drive.on = True
         else:
-            self._trajectory = motion.rest(t, self._shaft.at(t)[0])
-            self._set("Goal Position", round(self._shaft.at(t)[0] - self._fold) + self._offset)
-
-    def _halt(self, t: float) -> None:
-        """Stand still here, at once."""
-        self._shaft.hold(t)
-        self._trajectory = motion.rest(t, self._shaft.at(t)[0])
-        self._goal_pending = False
+            self._go(t)
 
     def _goal_written(self, t: float) -> None:
         self._goal_writes += 1
-        if self.torque:
-            self._go(t)
-        else:
+        by_goal = self._memory["Drive Mode"] & _TORQUE_BY_GOAL
+        if by_goal and not self._memory["Hardware Error Status"] & self._memory["Shutdown"]:
+            self._memory["Torque Enable"] = 1
+        if not self.torque:
             self._goal_pending = True
+        elif _GOAL_OF_MODE[self._memory["Operating Mode"]] == 116:
+            self._go(t)
         for fault, due in list(self._faults):
             if due is None and fault.at_goal_write == self._goal_writes:
                 self._faults.remove((fault, due))
@@ -433,20 +471,82 @@ class Servo:
         self.advance(t)
 
     def _go(self, t: float) -> None:
-        """Start a profile from where the shaft is to the goal."""
+        """Start towards the goal of the operating mode."""
+        memory, drive = self._memory, self._drive
         self._goal_pending = False
-        goal = self._peek("Goal Position") - self._offset + self._fold
-        profile_velocity = self._peek("Profile Velocity") * VELOCITY_UNIT or math.inf
-        profile_acceleration = self._peek("Profile Acceleration") * ACCELERATION_UNIT or math.inf
-        wanted, wanted_velocity = self._trajectory.at(t)
-        self._trajectory = motion.plan(t, wanted, wanted_velocity, goal, profile_velocity, profile_acceleration)
-        self._shaft.go(t, goal, profile_velocity, profile_acceleration)
+        mode = memory["Operating Mode"]
+        unit = self.model.motor.current_unit_a or 0.0
+        effort = 1.0 if mode == PWM else abs(memory["Goal PWM"]) / FULL_PWM
+        current = abs(memory["Goal Current"]) * unit if mode in (CURRENT, CURRENT_POSITION) else math.inf
+        acceleration = memory["Profile Acceleration"] * ACCELERATION_UNIT or math.inf
+        if mode == VELOCITY:
+            goal_velocity = self._sign * memory["Goal Velocity"] * VELOCITY_UNIT
+            drive.spin(t, goal_velocity, acceleration, effort=effort, current=current)
+        elif mode == PWM:
+            share = self._sign * memory["Goal PWM"] / FULL_PWM
+            drive.spin(t, share * drive.fastest, math.inf, effort=abs(share), current=current)
+        elif mode == CURRENT:
+            direction = self._sign * (memory["Goal Current"] > 0) - self._sign * (memory["Goal Current"] < 0)
+            drive.spin(t, direction * effort * drive.fastest, math.inf, effort=effort, current=current)
+        else:
+            goal = self._sign * (memory["Goal Position"] - self._offset + self._fold)
+            velocity = memory["Profile Velocity"] * VELOCITY_UNIT or math.inf
+            if memory["Drive Mode"] & _TIME_BASED:
+                distance = goal - drive.trajectory.at(t)[0]
+                velocity, acceleration = motion.limits_of_times(
+                    distance, 1e-3 * memory["Profile Velocity"], 1e-3 * memory["Profile Acceleration"]
+                )
+            stiffness = math.inf if memory["Position I Gain"] else memory["Position P Gain"] / 128.0 / FULL_PWM
+            drive.go(t, goal, velocity, acceleration, stiffness=stiffness, effort=effort, current=current)
 
-    def _strike(self, fault: Fault, t: float) -> None:
+    # ---- what happens by itself --------------------------------------------------------------------------------
+
+    def _due(self) -> list[tuple[float, Callable[[float], None]]]:
+        """Events that are to come, with their times [s]."""
+        events: list[tuple[float, Callable[[float], None]]] = []
+        for fault, moment in self._faults:
+            if moment is not None:
+                events.append((moment, lambda at, fault=fault, moment=moment: self._strike(fault, moment, at)))  # type: ignore[misc]
+        watchdog, errors = self._memory["Bus Watchdog"], self._memory["Hardware Error Status"]
+        if watchdog > 0 and self.torque:
+            # not at, but after that time
+            due = self._last_instruction + watchdog * WATCHDOG_UNIT_S
+            events.append((math.nextafter(due, math.inf), lambda at: self._bark(due)))
+        if (rests := self._drive.rests_at()) < math.inf:
+            events.append((rests, self._drive.settle))
+        if not errors & OVERLOAD and (overloaded := self._drive.overloaded_at()) < math.inf:
+            events.append((overloaded, lambda at: self._fail(OVERLOAD, at)))
+        if not errors & OVERHEATING and (hot := self._drive.heat.reaches(self._memory["Temperature Limit"])) < math.inf:
+            events.append((hot, lambda at: self._fail(OVERHEATING, at)))
+        volts = 10.0 * self._drive.supply_v
+        if not errors & INPUT_VOLTAGE and not (
+            self._memory["Min Voltage Limit"] <= volts <= self._memory["Max Voltage Limit"]
+        ):
+            events.append((-math.inf, lambda at: self._fail(INPUT_VOLTAGE, self._last_instruction)))
+        return events
+
+    def _bark(self, due: float) -> None:
+        """The bus watchdog found nobody."""
+        self._drive.hold(due)
+        self._memory["Bus Watchdog"] = -1
+        self._memory["Profile Acceleration"] = 0
+        self._memory["Profile Velocity"] = 0
+
+    def _fail(self, bits: int, t: float) -> None:
+        """Hardware Error Status gets `bits`; torque goes off if Shutdown says so."""
+        self._memory["Hardware Error Status"] |= bits
+        if self._memory["Hardware Error Status"] & self._memory["Shutdown"]:
+            self._drive.release(t)
+            self._goal_pending = False
+            self._memory["Torque Enable"] = 0
+
+    def _strike(self, fault: Fault, moment: float, t: float) -> None:
+        self._faults.remove((fault, moment))
         if fault.kind == "stuck":
-            self._shaft.seize(t)
-        elif fault.kind == "hardware":
-            self._memory[70] |= fault.bits
-            if self._memory[70] & self._memory[63]:
-                self._halt(t)
-                self._memory[64] = 0
+            self._drive.shaft.seize(t)
+        elif fault.kind == "obstacle":
+            self._drive.obstruct(t, fault.ahead_counts)
+        elif fault.kind == "reboot":
+            self.reboot(t)
+        else:
+            self._fail(fault.bits, t)

@@ -1,12 +1,14 @@
-"""The vendor's SDK, as it comes, talks to the simulated servos: on a pseudo-terminal and on a virtual clock.
+"""The vendor's SDK, as it comes, talks to the simulated servos: on a pseudo-terminal, over TCP and on a virtual clock.
 
-The SDK's protocol code is unmodified in both. On the pseudo-terminal only its module constant for the USB latency is
-raised, as its users do, so that a busy machine is no missing servo. On ``sim://`` a port subclass opens the URL and takes
-its time from the virtual clock.
+The SDK's protocol code is unmodified in all. On the pseudo-terminal and over TCP only its module constant for the USB
+latency is raised, as its users do, so that a busy machine is no missing servo; for TCP a port subclass opens the URL,
+which the SDK's own cannot. On ``sim://`` a port subclass opens the URL and takes its time from the virtual clock.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -20,7 +22,7 @@ from dynamixel_sdk import port_handler
 
 from sim.clock import ScaledClock, VirtualClock
 from sim.dynamixel import DynamixelBus, Servo
-from sim.links import PtyLink, Pump
+from sim.links import PtyLink, Pump, TcpLink
 from sim.port import attach, detach
 
 OK, TIMEOUT = sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT
@@ -69,16 +71,26 @@ def _virtual() -> Iterator[Line]:
     detach("conformance")
 
 
-def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
-    if sys.platform == "win32":
+class TcpPort(sdk.PortHandler):  # type: ignore[misc]
+    """The SDK's port on a URL."""
+
+    def setupPort(self, cflag_baud: int) -> bool:
+        self.ser = serial.serial_for_url(self.port_name, baudrate=self.baudrate, timeout=0)
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / self.baudrate
+        return True
+
+
+def _served(monkeypatch: pytest.MonkeyPatch, kind: str) -> Iterator[Line]:
+    if kind == "terminal" and sys.platform == "win32":
         pytest.skip("no pseudo-terminals")
     monkeypatch.setattr(port_handler, "LATENCY_TIMER", 500.0)
     clock, bus = ScaledClock(40.0), _bus()
-    link = PtyLink(bus, clock)
+    link = PtyLink(bus, clock) if kind == "terminal" else TcpLink(bus, clock)
     pump, stop = Pump(link), threading.Event()
     thread = threading.Thread(target=pump.run, args=(stop.is_set, 0.01))
     thread.start()
-    port = sdk.PortHandler(link.path)
+    port = TcpPort("socket://{}:{}".format(*link.address)) if isinstance(link, TcpLink) else sdk.PortHandler(link.path)
     try:
         assert port.openPort()
         yield Line(port, sdk.PacketHandler(2.0), bus, clock.sleep)
@@ -89,9 +101,123 @@ def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
         pump.close()
 
 
-@pytest.fixture(params=["virtual", "terminal"])
+@pytest.fixture(params=["virtual", "terminal", "tcp"])
 def line(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
-    yield from _virtual() if request.param == "virtual" else _terminal(monkeypatch)
+    yield from _virtual() if request.param == "virtual" else _served(monkeypatch, request.param)
+
+
+def word(value: int, size: int = 4) -> list[int]:
+    return list(value.to_bytes(size, "little"))
+
+
+API = (type(sdk.PacketHandler(2.0)), sdk.GroupSyncRead, sdk.GroupSyncWrite, sdk.GroupBulkRead, sdk.GroupBulkWrite)
+
+
+@pytest.fixture
+def uncalled(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of all methods of the SDK's classes; each leaves the set when it is called."""
+    names = set()
+    for owner in API:
+        for name, method in inspect.getmembers(owner, inspect.isfunction):
+            full = f"{owner.__name__}.{name}"
+            names.add(full)
+
+            def counted(*args: Any, _method: Any = method, _full: str = full, **kwargs: Any) -> Any:
+                names.discard(_full)
+                return _method(*args, **kwargs)
+
+            monkeypatch.setattr(owner, name, functools.wraps(method)(counted))
+    return names
+
+
+def test_the_whole_api(uncalled: set[str], line: Line) -> None:
+    """Rationale: every call that the SDK offers, with the value or the effect that the manual promises."""
+    packets, port = line.packets, line.port
+    packets.__init__()
+    assert packets.getProtocolVersion() == 2.0
+    assert packets.getTxRxResult(OK) and packets.getRxPacketError(sdk.ERRNUM_ACCESS)
+    assert packets.ping(port, 1) == (1020, OK, 0)
+    assert packets.broadcastPing(port) == ({id: [1020, 46] for id in (1, 2, 3)}, OK)
+
+    def fetch_status() -> None:
+        """Of a write for which the SDK does not wait."""
+        port.setPacketTimeout(11)
+        assert packets.rxPacket(port, False)[1] == OK
+
+    # one servo, all widths, whole or in two halves
+    assert packets.writeTxRx(port, 1, 112, 4, word(7)) == (OK, 0)
+    assert packets.readTxRx(port, 1, 112, 4) == (word(7), OK, 0)
+    assert packets.readTx(port, 1, 112, 4) == OK and packets.readRx(port, 1, 4) == (word(7), OK, 0)
+    for size, address, value in ((1, 65, 1), (2, 84, 850), (4, 108, 9)):
+        assert getattr(packets, f"write{size}ByteTxRx")(port, 1, address, value) == (OK, 0)
+        assert getattr(packets, f"read{size}ByteTxRx")(port, 1, address) == (value, OK, 0)
+        assert getattr(packets, f"write{size}ByteTxOnly")(port, 1, address, value - 1) == OK
+        fetch_status()
+        assert getattr(packets, f"read{size}ByteTx")(port, 1, address) == OK
+        assert getattr(packets, f"read{size}ByteRx")(port, 1) == (value - 1, OK, 0)
+    assert packets.writeTxOnly(port, 1, 65, 1, [1]) == OK
+    fetch_status()
+    assert packets.regWriteTxOnly(port, 1, 65, 1, [0]) == OK
+    fetch_status()
+    assert packets.regWriteTxRx(port, 1, 65, 1, [0]) == (OK, 0)
+    assert packets.action(port, 1) == OK
+    fetch_status()  # the SDK does not wait for that one either
+    assert packets.read1ByteTxRx(port, 1, 65) == (0, OK, 0)
+    assert packets.clearMultiTurn(port, 1) == (OK, 0)
+    # many at once
+    write = sdk.GroupSyncWrite(port, packets, 112, 4)
+    assert write.addParam(1, word(1)) and write.addParam(2, word(2)) and write.addParam(3, word(3))
+    assert write.changeParam(2, word(22))
+    write.removeParam(3)
+    assert write.txPacket() == OK
+    write.clearParam()
+    many = sdk.GroupBulkWrite(port, packets)
+    assert many.addParam(1, 84, 2, word(700, 2)) and many.addParam(2, 65, 1, [1]) and many.addParam(3, 65, 1, [1])
+    assert many.changeParam(3, 112, 4, word(33))
+    assert many.txPacket() == OK
+    many.removeParam(1)
+    many.clearParam()
+    read = sdk.GroupSyncRead(port, packets, 112, 4)
+    assert all(read.addParam(id) for id in (1, 2, 3))
+    for ask in (read.txRxPacket, read.fastSyncRead):
+        assert ask() == OK
+        assert [read.getData(id, 112, 4) for id in (1, 2, 3) if read.isAvailable(id, 112, 4)] == [1, 22, 33]
+    assert (read.txPacket(), read.rxPacket(), read.fastSyncReadTxPacket(), read.fastSyncReadRxPacket()) == (OK,) * 4
+    read.removeParam(1)
+    read.clearParam()
+    bulk = sdk.GroupBulkRead(port, packets)
+    assert bulk.addParam(1, 84, 2) and bulk.addParam(2, 65, 1)
+    for ask in (bulk.txRxPacket, bulk.fastBulkRead):
+        assert ask() == OK
+        assert bulk.isAvailable(1, 84, 2) and (bulk.getData(1, 84, 2), bulk.getData(2, 65, 1)) == (700, 1)
+    assert (bulk.txPacket(), bulk.rxPacket(), bulk.fastBulkReadTxPacket(), bulk.fastBulkReadRxPacket()) == (OK,) * 4
+    bulk.removeParam(1)
+    bulk.clearParam()
+    # the end
+    assert packets.reboot(port, 1) == (OK, 0)
+    assert packets.read4ByteTxRx(port, 1, 112) == (0, OK, 0)
+    assert packets.factoryReset(port, 1, 2) == (OK, 0)
+    assert uncalled == set()
+
+
+def test_the_vendors_high_level_sdk_finds_and_moves_the_servos(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The part of the SDK for end users: motors found by their model, their tables from the vendor's files."""
+    from dynamixel_easy_sdk import Connector, OperatingMode
+
+    for line in _served(monkeypatch, "terminal"):
+        line.port.closePort()
+        connector = Connector(line.port.port_name, 1_000_000)
+        motors = [connector.createMotor(id) for id in (1, 2, 3)]
+        assert [motor.getPresentPosition() for motor in motors] == [1000, 2000, 3000]
+        motor = motors[0]
+        motor.setOperatingMode(OperatingMode.EXTENDED_POSITION)
+        motor.setPositionPGain(900)
+        motor.enableTorque()
+        motor.setGoalPosition(5000)
+        line.wait(10.0)
+        assert motor.getPresentPosition() == pytest.approx(5000, abs=3)
+        assert (motor.isTorqueOn(), motor.getMaxPositionLimit()) == (1, 4095)
+        connector.closePort()
 
 
 def test_ping_read_and_write_of_every_width(line: Line) -> None:
@@ -175,12 +301,6 @@ def test_an_absent_servo_is_a_timeout_and_nothing_hangs(line: Line) -> None:
     packets, port = line.packets, line.port
     assert packets.ping(port, 77)[1] == TIMEOUT
     assert packets.ping(port, 1) == (1020, OK, 0)
-
-
-def test_broadcast_ping_finds_all() -> None:
-    """On the virtual clock alone: the SDK waits 0.8 s for it."""
-    for line in _virtual():
-        assert line.packets.broadcastPing(line.port) == ({id: [1020, 46] for id in (1, 2, 3)}, OK)
 
 
 def test_what_the_sdk_fails_to_stuff_is_lost_and_nothing_else() -> None:

@@ -7,8 +7,12 @@ polynomial, which all other examples confirm.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from sim.dynamixel import DynamixelBus, Servo
+from sim.dynamixel.control_table import XM430_W350
 from sim.dynamixel.packet import (
     BROADCAST,
     Damaged,
@@ -155,6 +159,66 @@ def test_an_unstuffed_packet_is_dropped_and_the_next_one_heard() -> None:
     assert Parser().receive(unstuffed + encode(1, Instruction.PING)) == [Packet(1, Instruction.PING)]
 
 
+def _as_in_the_manual() -> DynamixelBus:
+    """Servos in the state of the manual's examples: XM430-W210, firmware 38, and one of a firmware with fast reads."""
+    old = replace(XM430_W350, number=1030)
+    positions = {1: 166.0, 2: 2079.0, 3: 166.0, 7: 2079.0, 4: 1023.0}
+    servos = [
+        Servo(id, old, firmware=38 if id < 3 else 45, initial_counts=position, supply_v=11.9)
+        for id, position in positions.items()
+    ]
+    return DynamixelBus(servos)
+
+
+DIALOGUES = [
+    ("ping", ["ping 1"]),
+    ("ping all", ["ping 1", "ping 2"]),
+    ("read", ["position 166"]),
+    ("write", ["done"]),
+    ("reg write", ["done"]),
+    ("factory reset", ["done"]),
+    ("reboot", ["done"]),
+    ("clear", ["done"]),
+    ("sync read", ["position 166", "position 2079"]),
+    ("sync write", []),
+    ("bulk write", []),
+]
+
+
+@pytest.mark.parametrize(("asked", "answered"), DIALOGUES, ids=[row[0] for row in DIALOGUES])
+def test_dialogues_of_the_manual(asked: str, answered: list[str]) -> None:
+    """The manual's instruction in, byte for byte, and byte for byte the manual's status out."""
+    frames = {name: text for name, text, _ in INSTRUCTIONS}
+    statuses = {name: bytes.fromhex(text) for name, text, *_ in STATUSES}
+    bus = _as_in_the_manual()
+    got = [reply for _, reply in bus.feed(bytes.fromhex(frames[asked]), 0.0)]
+    if asked == "ping all":
+        got = got[:2]
+    assert got == [statuses[name] for name in answered]
+
+
+def test_bulk_and_fast_dialogues_of_the_manual() -> None:
+    frames = {name: bytes.fromhex(text) for name, text, _ in INSTRUCTIONS}
+    bus = _as_in_the_manual()
+    first, second = (reply for _, reply in bus.feed(frames["bulk read"], 0.0))
+    assert first == bytes.fromhex("FFFFFD00 01 0600 55 00 7700 C369")  # 11.9 V
+    assert second == encode_status(2, 0, b"\x1f")  # 31 C here, 36 C there
+    ((_, fast),) = bus.feed(frames["fast sync read"], 0.0)
+    assert fast == bytes.fromhex("FFFFFD00 FE 1900 55 00 03 A6000000 8408 00 07 1F080000 16CA 00 04 FF030000 D19E")
+    ((_, fast),) = bus.feed(frames["fast bulk read"], 0.0)
+    assert fast[:14] == bytes.fromhex("FFFFFD00 FE 1400 55 00 03 A6000000")
+    assert [fast[k] for k in (16, 17, 22, 23)] == [0, 7, 0, 4] and crc16(fast[:-2]) == int.from_bytes(fast[-2:], "little")
+
+
+def test_stuffed_dialogues_of_the_manual() -> None:
+    """A goal of -131073 arrives, and a current of -1 with a velocity of -3 comes back stuffed."""
+    bus = DynamixelBus([Servo(1)])
+    bus.feed(encode(1, Instruction.WRITE, b"\x0b\0\x04"), 0.0)
+    assert bus.feed(bytes.fromhex("FFFFFD00 01 0A00 03 7400 FFFFFDFDFF 23E5"), 0.0)[0][1] == encode_status(1, 0)
+    ((_, reply),) = bus.feed(encode(1, Instruction.READ, b"\x74\0\x04\0"), 0.0)
+    assert reply == encode_status(1, 0, b"\xff\xff\xfd\xff") and b"\xff\xff\xfd\xfd\xff" in reply
+
+
 def test_stuffing_both_ways() -> None:
     # All payloads of up to seven bytes out of those that make headers.
     payloads = [b""]
@@ -162,4 +226,5 @@ def test_stuffing_both_ways() -> None:
         payloads += [payload + bytes((byte,)) for payload in payloads[-(3**_) :] for byte in (0xFF, 0xFD, 0x00)]
     for payload in payloads:
         assert unstuff(stuff(payload)) == payload
+        assert Parser().receive(encode(1, Instruction.WRITE, payload)) == [Packet(1, Instruction.WRITE, payload)]
         assert Parser().receive(encode_status(1, 0, payload)) == [Packet(1, Instruction.STATUS, b"\0" + payload)]
