@@ -25,6 +25,7 @@ from gonio.config.rig import (
     RigConfig,
     SimConfig,
     WhiteConfig,
+    ZoneConfig,
     load_rig,
     parse_rig,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "SimConfig",
     "SourceConfig",
     "WhiteConfig",
+    "ZoneConfig",
     "default_documents",
     "load_fit",
     "load_plan",

@@ -174,6 +174,14 @@ class SimConfig:
 
 
 @dataclass(frozen=True)
+class ZoneConfig:
+    """Joint angles at which parts would collide: the ranges of axis angles [rad] that are forbidden together."""
+
+    name: str
+    ranges: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
 class RigConfig:
     """A rig.
 
@@ -186,6 +194,8 @@ class RigConfig:
         Rest after the axes have settled, for the arm to stop ringing [s].
     moved : float
         Largest change of a joint angle during an exposure [rad]; beyond it the pose is exposed again.
+    zones : tuple of ZoneConfig
+        Where parts would collide.
     text : str
         The document itself.
     """
@@ -200,6 +210,7 @@ class RigConfig:
     lamp: LampConfig
     white: WhiteConfig
     sim: SimConfig | None
+    zones: tuple[ZoneConfig, ...] = ()
     text: str = field(default="", repr=False, compare=False)
 
     @property
@@ -253,6 +264,7 @@ def parse_rig(text: str, name: str = "rig.toml", *, folder: Path | None = None) 
         lamp=lamp,
         white=_white(root.table("white")),
         sim=sim,
+        zones=tuple(_zone(table) for table in root.tables("zone")),
         text=text,
     )
     for table in (rig, bus, axes, root):
@@ -379,6 +391,21 @@ def _white(table: Table) -> WhiteConfig:
         tilt=table.angle("tilt_deg", 0.0, lower=-180.0, upper=180.0),
         repeats=table.integer("repeats", 4, lower=1, upper=1000),
     )
+    table.finish()
+    return config
+
+
+def _zone(table: Table) -> ZoneConfig:
+    ranges = {}
+    for axis in AXES:
+        if f"{axis}_deg" in table:
+            low, high = (*table.angles(f"{axis}_deg", count=2, lower=-180.0, upper=180.0), 0.0, 0.0)[:2]
+            ranges[axis] = (low, high)
+            if low > high:
+                table.report(f"{axis}_deg", f"= {[math.degrees(low), math.degrees(high)]} must go from low to high")
+    config = ZoneConfig(table.text("name"), ranges)
+    if not ranges:
+        table.report("", f"names no axis; give one or more of {', '.join(f'{axis}_deg' for axis in AXES)} = [low, high]")
     table.finish()
     return config
 

@@ -12,6 +12,7 @@ import numpy as np
 from gonio.config import RigConfig
 from gonio.errors import DeviceTimeoutError, MeasurementError
 from gonio.interfaces import Axis, AxisReading, Clock
+from gonio.scan import zones
 from gonio.scan.plan import AXES, move_seconds
 
 ATTEMPTS = 3
@@ -55,18 +56,28 @@ class Motion:
 
         Raises
         ------
+        LimitError
+            If the way leads through a zone; nothing was sent.
         DeviceError
             If an axis cannot get there, or not in time.
         """
         here = {axis: reading.angle for axis, reading in self.read().items()}
-        start, end = ([angles[axis] for axis in AXES] for angles in (here, goal))
+        for part in zones.stages(here, goal, self._config):
+            self._together(here, part)
+            here |= part
+        self.wait(self._config.settle_s)
+        return self.read()
+
+    def _together(self, here: Mapping[str, float], goal: Mapping[str, float]) -> None:
+        """Move the axes of `goal` at the same time, from `here` [rad]."""
+        start, end = ([angles[axis] for axis in AXES] for angles in (here, {**here, **goal}))
         expected_s = float(move_seconds(start, end, self._config.axes))
         limit_s = _PATIENCE * expected_s + _GRACE_S
-        for axis in AXES:
+        for axis in goal:
             self._check_stop()
             self._axes[axis].move_to(goal[axis])
         deadline_s = self._clock.now() + limit_s
-        pending = list(AXES)
+        pending = list(goal)
         while pending := [axis for axis in pending if not self._axes[axis].settled()]:
             if self._clock.now() > deadline_s:
                 standing = self.read()
@@ -80,8 +91,6 @@ class Motion:
                 )
             self._check_stop()
             self._clock.sleep(_POLL_S)
-        self.wait(self._config.settle_s)
-        return self.read()
 
     def read(self) -> dict[str, AxisReading]:
         """Measure all axes."""

@@ -19,6 +19,7 @@ from gonio import geometry, halfdiff, kinematics
 from gonio.config import AxisConfig, PlanConfig, RigConfig
 from gonio.errors import ConfigurationError, DatasetError
 from gonio.interfaces import AxisLimits
+from gonio.scan import zones
 
 Array = NDArray[np.float64]
 AXES = kinematics.AXES
@@ -110,11 +111,16 @@ def make_plan(plan: PlanConfig, rig: RigConfig) -> Plan:
             left_out.append(LeftOut(theta_i, theta_r, phi, reasons))
             continue
         reach = kinematics.reach(theta_i, theta_r, phi, limits, g_min=rig.g_min)
-        if not reach.solutions:
-            left_out.append(LeftOut(theta_i, theta_r, phi, reach.reasons))
+        reasons, solutions = reach.reasons, []
+        for joints in (solution._asdict() for solution in reach.solutions):
+            against = zones.reasons(joints, rig)
+            reasons += against
+            if not against:
+                solutions.append(joints)
+        if not solutions:
+            left_out.append(LeftOut(theta_i, theta_r, phi, reasons))
             continue
-        joints = reach.solutions[len(found) % len(reach.solutions)]
-        found.append(Pose(len(found), theta_i, theta_r, phi, dict(zip(AXES, joints, strict=True))))
+        found.append(Pose(len(found), theta_i, theta_r, phi, solutions[len(found) % len(solutions)]))
     if not found:
         first = left_out[0].reasons[0] if left_out else "there are none"
         raise ConfigurationError(

@@ -17,6 +17,7 @@ import numpy as np
 from gonio import kinematics
 from gonio.config import PlanConfig, RigConfig
 from gonio.errors import ConfigurationError
+from gonio.scan import zones
 from gonio.scan.plan import AXES, LeftOut, Plan, Pose, approach_limits, move_seconds
 
 _OUTSIDE = re.compile(r"(\w+) [-+.\d]+ deg is outside")
@@ -109,11 +110,13 @@ def check(plan: Plan, config: PlanConfig, rig: RigConfig) -> Preflight:
     ------
     ConfigurationError
         If a pose is beyond a limit or behind an obstacle, as in a run whose rig has been changed; nothing has moved.
+    LimitError
+        If the way between two poses leads through a zone; nothing has moved.
     """
     limits = approach_limits(rig.axes)
     for pose in plan.poses:
         arm, pan, tilt = (pose.joints[a] for a in AXES)
-        against = kinematics.obstacles(arm, pan, tilt, limits, g_min=rig.g_min)
+        against = kinematics.obstacles(arm, pan, tilt, limits, g_min=rig.g_min) + zones.reasons(pose.joints, rig)
         if against:
             raise ConfigurationError(f"pose {pose.index} cannot be taken: {'; '.join(against)}; plan it anew for this rig")
     exposures = config.bracket_s or rig.camera.exposures_s
@@ -125,6 +128,9 @@ def check(plan: Plan, config: PlanConfig, rig: RigConfig) -> Preflight:
     every = config.white_every
     visits = [0, *(range(every, n, every) if every else ()), n]  # a white block before the pose of that number
     path = np.concatenate([np.vstack((white, joints[a:b])) for a, b in itertools.pairwise(visits)] + [white[None]])
+    if rig.zones:
+        for start, goal in itertools.pairwise(path):
+            zones.stages(dict(zip(AXES, start, strict=True)), dict(zip(AXES, goal, strict=True)), rig)
     move_s = float(np.sum(move_seconds(path[:-1], path[1:], rig.axes)))
     dark_s = config.darks * bracket_s
     frames = (n + len(visits) * repeats + config.darks) * len(exposures)
@@ -151,6 +157,8 @@ def _kind(reasons: tuple[str, ...]) -> str:
     text = " ".join(reasons)
     if "horizon" in text or "theta_max" in text or "behind the surface" in text:
         return "too steep for lamp or camera"
+    if "lies in the zone" in text:
+        return "in a zone of collision"
     if "hides" in text or "in line" in text:
         return "the light arm would hide the sample"
     outside = dict.fromkeys(_OUTSIDE.findall(text))
