@@ -98,7 +98,7 @@ def gtr_lambda(y: mpf, alpha: mpf, gamma: mpf) -> mpf:
         low = (root - y) / a2  # of A^-3/2: its first moment beyond y less y times its integral
         high = 1 / (3 * root**3) - y / (3 * a2**2) * (2 - y * (3 * a2 + 2 * y**2) / root**3)
         return c * pi / 2 * (low + mpf(3) / 4 * (1 - a2) * high) / y
-    with mpmath.workdps(32):
+    with mpmath.workdps(max(32, mpmath.mp.dps)):
         total = mpf(0)
         for x2, weight in _steps()[: 6 * int(10 + 40 + max(0, -log(y)))]:
             t2 = y * y * (1 + x2)
@@ -109,8 +109,9 @@ def gtr_lambda(y: mpf, alpha: mpf, gamma: mpf) -> mpf:
 @functools.cache
 def _steps() -> list[tuple[mpf, mpf]]:
     """x^2 and x^2 (x - arctan x) du at steps of 1/6 in u = ln x, from -10; analytic for abs(Im u) < pi / 2."""
-    steps = [exp(mpf(k) / 6) for k in range(-60, 480)]
-    return [(x * x, x * x * (x - atan(x)) / 6) for x in steps]
+    with mpmath.workdps(150):
+        steps = [exp(mpf(k) / 6) for k in range(-60, 480)]
+        return [(x * x, x * x * (x - atan(x)) / 6) for x in steps]
 
 
 # --- F --------------------------------------------------------------------------------------------------------------------

@@ -100,6 +100,8 @@ class Model:
     derived : callable, optional
         Of the parameters (n,): numbers (m,) that depend on them only and that the function finds behind them in the
         parameter array, such as a table of albedos.
+    derived_slopes : callable, optional
+        Of the parameters (n,): derivatives of these numbers by each parameter (n, m). Without it they come from differences.
     array_function : callable, optional
         ``(omega_i (n, 3), omega_r (n, 3), p) -> (n,)`` for code that is not compiled; `function` is then None.
     diffuse : bool
@@ -120,6 +122,7 @@ class Model:
     kinks: Callable[[Array, Array], Array] | None = None
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None
+    derived_slopes: Callable[[Array], Array] | None = None
     array_function: Callable[[Array, Array, Array], Array] | None = None
     diffuse: bool = False
     isotropic: bool = True

@@ -115,6 +115,8 @@ def seeds(model: Model, p: Array) -> Array:
     k = len(model.parameters)
     if model.derived is None:
         return np.eye(k, len(p))
+    if model.derived_slopes is not None:
+        return np.concatenate((np.eye(k), model.derived_slopes(p[:k])), axis=1)
     return _seeds(model.derived, model.parameters, tuple(map(float, p[:k])))
 
 

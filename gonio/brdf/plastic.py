@@ -37,16 +37,24 @@ _DEEPEST = 20.0  # of t, where e^-2t is nothing
 
 def diffuse_reflectance(n: float) -> float:
     """Fresnel reflectance of a surface of refractive index n >= 1 for diffuse light from outside, to 1e-15."""
+    return _diffuse(n)[0]
+
+
+def _diffuse(n: float) -> tuple[float, float]:
+    """Fresnel reflectance for diffuse light from outside, and its derivative by n."""
     m2 = (n - 1.0) * (n + 1.0)
     end = min(math.asinh(1.0 / math.sqrt(m2)), _DEEPEST) if m2 > 0.0 else _DEEPEST
     x, w = np.polynomial.legendre.leggauss(_NODES)
     edges = np.linspace(0.0, end, math.ceil(end) + 1)
     half = 0.5 * np.diff(edges)[:, None]
     t = edges[:-1, None] + half * (1.0 + x)
-    parallel = (m2 * np.sinh(t) - np.exp(-t)) / (n * n * np.sinh(t) + np.cosh(t))
+    below = n * n * np.sinh(t) + np.cosh(t)
+    parallel = (m2 * np.sinh(t) - np.exp(-t)) / below
     # 2 mu F dmu = m^2 sinh 2t F dt; r_s = -e^-2t
-    integrand = m2 * np.sinh(2.0 * t) * 0.5 * (np.exp(-4.0 * t) + parallel**2)
-    return float(np.sum(half * w * integrand))
+    f, w = 0.5 * (np.exp(-4.0 * t) + parallel**2), half * w * np.sinh(2.0 * t)
+    # the end of t moves with n, and dr_p / dn = 2 n sinh 2t / (n^2 sinh t + cosh t)^2
+    change = 2.0 * n * (f + m2 * parallel * np.sinh(2.0 * t) / below**2)
+    return float(np.sum(w * f)) * m2, float(np.sum(w * change)) - 2.0 * n * (n - 1.0) / (n + 1.0) ** 3
 
 
 @jit.model
@@ -81,6 +89,16 @@ def _scale(p: Array) -> Array:
     return np.array([albedo * INV_PI / (n * n * (1.0 - albedo) + albedo * (1.0 - diffuse_reflectance(n)))])
 
 
+def _scale_slopes(p: Array) -> Array:
+    """Its derivatives; next to n = 1, where it is not smooth, differences would lose them."""
+    albedo, n = float(p[0]), float(p[1])
+    f, slope = _diffuse(n)
+    below = n * n * (1.0 - albedo) + albedo * (1.0 - f)
+    by_albedo = n * n / below**2
+    by_n = -albedo * (2.0 * n * (1.0 - albedo) - albedo * slope) / below**2
+    return INV_PI * np.array([[by_albedo], [by_n]])
+
+
 PLASTIC = Model(
     name="plastic",
     parameters=(
@@ -91,4 +109,5 @@ PLASTIC = Model(
     doc="Diffuse base below a smooth dielectric surface, without the gloss.",
     reference="Wolff, JOSA A 11, 1994; Duntley, JOSA 32, 1942",
     derived=_scale,
+    derived_slopes=_scale_slopes,
 )

@@ -32,6 +32,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import digamma
 
 from gonio import jit
 from gonio.brdf.base import Model, Parameter
@@ -78,9 +79,22 @@ def _k_correlation_width(p: Array) -> float:
 
 def _peak(p: Array) -> Array:
     """f_r / (mu_i mu_r) at the mirror direction [1/sr]."""
-    a, b, c, wavelength = p
+    return np.array([p[0] * _peak_of_one(p)])
+
+
+def _peak_of_one(p: Array) -> float:
+    """The same for A = 1."""
+    _, b, c, wavelength = map(float, p)
     gammas = math.exp(math.lgamma(0.5 * (c + 1.0)) - math.lgamma(0.5 * c))
-    return np.array([SIXTEEN_PI2 / wavelength**4 * gammas / (2.0 * math.sqrt(math.pi)) * a * b])
+    return SIXTEEN_PI2 / wavelength**4 * gammas / (2.0 * math.sqrt(math.pi)) * b
+
+
+def _peak_slopes(p: Array) -> Array:
+    """Its derivatives by A, B, C and the wavelength."""
+    a, b, c, wavelength = map(float, p)
+    one = _peak_of_one(p)
+    by_c = 0.5 * float(digamma(0.5 * (c + 1.0)) - digamma(0.5 * c))
+    return one * np.array([[1.0], [a / b], [a * by_c], [-4.0 * a / wavelength]])
 
 
 ABG = Model(
@@ -122,5 +136,6 @@ K_CORRELATION = Model(
     reference="Church, Takacs & Leonard, Proc. SPIE 1165, 1989; Stover, Optical Scattering, SPIE, 2012",
     lobe_width=_k_correlation_width,
     derived=_peak,
+    derived_slopes=_peak_slopes,
     energy_bounded=False,
 )

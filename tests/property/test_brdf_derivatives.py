@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from gonio.brdf.elementary import exp, log, log1p, power
 from gonio.brdf.tangent import tangent
 from gonio.errors import ParameterError
 from gonio.geometry import unit_vector
+from tests.brdf_formulas import MICROFACETS, PLAIN, SHORTS, Case
 from tests.brdf_truth import Geometry
 from tests.gates import record
 
@@ -61,60 +62,66 @@ def agree(got: Array, truth: Array, floor: float = 0.0) -> float:
 # --- the primary formulas -------------------------------------------------------------------------------------------------
 
 
-def lambertian(g: Geometry, albedo: mpf) -> mpf:
-    return albedo / mpmath.pi
+def _sets(case: Case) -> Iterator[tuple[dict[str, Any], list[str]]]:
+    """Ordinary values and all derivatives; then each other value of a parameter, and the derivative by it."""
+    sets = case.one_at_a_time()
+    first = next(sets)
+    yield first, [*case.values]
+    for other in sets:
+        moved = [name for name in case.values if other[name] != first[name]]
+        if len(moved) == 1:
+            yield other, moved
 
 
-def ggx(g: Geometry, k_s: mpf, alpha: mpf, f_0: mpf) -> mpf:
-    """Walter et al. 2007 eq. 33, Heitz 2014 eqs. 72 and 99, Schlick 1994."""
-    d = alpha**2 / (mpmath.pi * g.mu_h**4 * (alpha**2 + g.tan2_h) ** 2)
-    lambdas = [(mpmath.sqrt(1 + alpha**2 * mpmath.tan(t) ** 2) - 1) / 2 for t in (g.theta_i, g.theta_r)]
-    fresnel = f_0 + (1 - f_0) * (1 - g.cos_d) ** 5
-    return k_s * fresnel * d / (1 + sum(lambdas)) / (4 * g.mu_i * g.mu_r)
+BARE = [case for case in MICROFACETS if [*case.choices.values()][1:] == ["none", "smith"]]
 
 
-def phong(g: Geometry, k_s: mpf, n: mpf) -> mpf:
-    """Lafortune & Willems 1994."""
-    along = 2 * g.mu_i * g.mu_r - g.cos_g
-    return k_s * (n + 2) / (2 * mpmath.pi) * along**n if along > 0 else mpf(0)
+@pytest.mark.parametrize("case", [*PLAIN, *SHORTS], ids=str)
+def test_derivatives_of_the_primary_formulas(case: Case) -> None:
+    assert against_primary(case, _sets(case)) <= LIMIT
 
 
-def oren_nayar(g: Geometry, albedo: mpf, sigma: mpf) -> mpf:
-    """Oren & Nayar 1994, the qualitative model."""
-    s2 = sigma**2
-    a, b = 1 - s2 / (2 * (s2 + mpf("0.33"))), mpf("0.45") * s2 / (s2 + mpf("0.09"))
-    high, low = max(g.theta_i, g.theta_r), min(g.theta_i, g.theta_r)
-    return albedo / mpmath.pi * (a + b * max(mpf(0), mpmath.cos(g.dphi)) * mpmath.sin(high) * mpmath.tan(low))
+def test_derivatives_of_tabulated_numbers() -> None:
+    """Student's t: its Smith's function is a table that is made of alpha and gamma."""
+    (case,) = (case for case in BARE if case.choices["distribution"] == "std")
+    assert against_primary(case, itertools.islice(_sets(case), 1)) <= LIMIT
 
 
-@pytest.mark.parametrize(
-    ("name", "formula", "values"),
-    [
-        ("lambertian", lambertian, {"albedo": 0.3}),
-        ("ggx", ggx, {"k_s": 0.7, "alpha": 0.3, "f_0": 0.04}),
-        ("ggx", ggx, {"k_s": 1.0, "alpha": 1e-4, "f_0": 0.0}),
-        ("ggx", ggx, {"k_s": 0.0, "alpha": 1.0, "f_0": 1.0}),
-        ("phong", phong, {"k_s": 0.7, "n": 0.0}),
-        ("phong", phong, {"k_s": 0.7, "n": 30.0}),
-        ("phong", phong, {"k_s": 0.7, "n": 1e8}),
-        ("oren_nayar", oren_nayar, {"albedo": 0.8, "sigma": 0.0}),
-        ("oren_nayar", oren_nayar, {"albedo": 0.8, "sigma": 0.4}),
-        ("oren_nayar", oren_nayar, {"albedo": 1.0, "sigma": math.pi / 2}),
-    ],
-)
-def test_derivatives_of_the_primary_formulas(name: str, formula: Callable[..., mpf], values: dict[str, float]) -> None:
+def against_primary(case: Case, sets: Iterable[tuple[dict[str, Any], list[str]]]) -> float:
+    """Largest error of the derivatives over parameter sets and directions, relative to the largest derivative."""
     omega_i, omega_r = directions()
-    brdf = make(name, **values)
-    truth = np.zeros((len(omega_i), len(values)))
-    with mpmath.workdps(40):
-        for k, j in itertools.product(range(len(omega_i)), range(len(values))):
-            g, x = Geometry(omega_i[k], omega_r[k]), [mpf(v) for v in values.values()]
-            side = _side(families.find(name).model().parameters[j], float(x[j]))
-            truth[k, j] = mpmath.diff(
-                lambda t, g=g, x=x, j=j: formula(g, *x[:j], t, *x[j + 1 :]), x[j], direction=side  # type: ignore[misc]
-            )
-    # off the peak of an exponent of 1e8 one rounding of a direction counts 1e8 times
-    assert agree(brdf.jacobian(omega_i, omega_r), truth) <= (LIMIT if values.get("n", 0) < 1e6 else 1e-7)
+    geometries = [Geometry(*pair) for pair in zip(omega_i, omega_r, strict=True)]
+    model, names, worst = families.find(case.name).model(**case.choices), [*case.values], 0.0
+    for given, chosen in sets:
+        columns = [names.index(name) for name in chosen]
+        with mpmath.workdps(60):
+            x = [mpf(given[name]) for name in names]
+            truth = np.array([
+                [derivative(case.formula, at, names, x, j, model.parameters[j]) for j in columns] for at in geometries
+            ], dtype=float)  # fmt: skip
+        brdf = make(case.name, **given)
+        floor = _floor(brdf, omega_i, omega_r, [*map(float, x)], columns)
+        error = agree(brdf.jacobian(omega_i, omega_r)[:, columns], truth, floor)
+        print(f"{case} at {given}: {error:.1e}")
+        worst = max(worst, error)
+    return worst
+
+
+def derivative(
+    formula: Callable[..., mpf], at: Geometry, names: list[str], x: list[mpf], j: int, parameter: Parameter
+) -> mpf:
+    """Of the formula by its j-th parameter, from inside at the end of a range."""
+
+    def moved(t: mpf) -> mpf:
+        return formula(at, **dict(zip(names, [*x[:j], t, *x[j + 1 :]], strict=True)))
+
+    return mpmath.diff(moved, x[j], direction=_side(parameter, float(x[j])))
+
+
+def _floor(brdf: BRDF, omega_i: Array, omega_r: Array, values: Sequence[float], chosen: list[int]) -> float:
+    """A parameter so large that it hardly matters, such as gamma at 1e6, has a derivative of what rounding leaves of f."""
+    largest = float(np.max(brdf.evaluate(omega_i, omega_r)))
+    return 0.1 * largest / max(1.0, *map(abs, values)) if len(chosen) == 1 else 0.0
 
 
 def _side(parameter: Parameter, x: float) -> int:
@@ -196,14 +203,16 @@ def test_every_model_against_itself_in_mpmath(expression: str) -> None:
 
 
 @pytest.mark.gate
-def test_gate_every_model_against_itself_in_mpmath() -> None:
-    worst = {expression: against_itself(expression) for expression in MODELS}
-    assert max(worst.values()) <= LIMIT
-    name = max(worst, key=lambda n: worst[n])
-    record(
-        "derivatives of every model, inside and at the ends of all ranges", f"{worst[name]:.1e} ({name}) of the largest one",
-        f"<= {LIMIT:g}", "-", "pytest -m gate -k derivatives",
-    )  # fmt: skip
+def test_gate_derivatives() -> None:
+    own = {expression: against_itself(expression) for expression in MODELS}
+    primary = {str(case): against_primary(case, _sets(case)) for case in (*PLAIN, *SHORTS, *BARE)}
+    for what, worst in (("themselves in mpmath", own), ("the primary formulas", primary)):
+        name = max(worst, key=lambda n, worst=worst: worst[n])  # type: ignore[misc]
+        record(
+            f"derivatives of the BRDF models against {what}", f"{worst[name]:.1e} ({name}) of {len(worst)} models",
+            f"<= {LIMIT:g} of the largest one", "-", "pytest -m gate tests/property/test_brdf_derivatives.py",
+        )  # fmt: skip
+    assert max(*own.values(), *primary.values()) <= LIMIT
 
 
 def against_itself(expression: str) -> float:
@@ -226,9 +235,7 @@ def against_itself(expression: str) -> float:
                     return twin(*w, [a + t * b if b else a for a, b in zip(start, slope, strict=True)])
 
                 truth[k, j] = mpmath.diff(moved, 0, direction=side)
-        # a parameter so large that it hardly matters, such as gamma at 1e6, has a derivative of what rounding leaves of f
-        largest = float(np.max(brdf.evaluate(omega_i, omega_r)))
-        floor = 0.1 * largest / max(1.0, *map(abs, values)) if len(chosen) == 1 else 0.0
+        floor = _floor(brdf, omega_i, omega_r, values, chosen)
         error = agree(brdf.jacobian(omega_i, omega_r)[:, chosen], truth[:, chosen], floor)
         print(f"{expression} at {values}: {error:.1e}")
         worst = max(worst, error)
