@@ -1,9 +1,9 @@
-"""Cornell ``.brdf`` text, as pbrt-v2 reads it: rows of four angles and a value for each wavelength, read only.
+"""Cornell ``.brdf`` text, as pbrt-v2 reads it: rows of four angles and a value for each wavelength.
 
 ``#`` begins a comment. The numbers are: how many wavelengths, the wavelengths [nm], then rows theta_i, phi_i, theta_r,
-phi_r [rad] and the BRDF [1/sr] at each wavelength, in free format. The mirror direction is at phi_r = phi_i + pi. gonio
-has one channel: the wavelength nearest to 555 nm is read unless another is asked for. Rows at or below the horizon are
-left out and counted; values are data even where they are 0. There are no uncertainties: u_f_r is NaN.
+phi_r [rad] and the BRDF [1/sr] at each wavelength, in free format. The mirror direction is at phi_r = phi_i + pi. Rows at
+or below the horizon are left out and counted; values are data even where they are 0. There are no uncertainties: u_f_r is
+NaN. Channels without a wavelength are written at nominal ones, which a comment says.
 
 References
 ----------
@@ -12,16 +12,18 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from gonio import files
+from gonio.channels import PHOTOPIC_PEAK_NM, ChannelSamples, spectral
 from gonio.errors import DatasetError
-from gonio.samples import BRDFSamples
+from gonio.formats import rows
 
 MOST_WAVELENGTHS = 2000
-PHOTOPIC_PEAK_NM = 555.0
+NOMINAL_NM = {"single": (PHOTOPIC_PEAK_NM,), "rgb": (610.0, 550.0, 465.0), "xyz": (600.0, 555.0, 445.0)}
 
 
 def sniff(head: bytes) -> bool:
@@ -36,15 +38,8 @@ def sniff(head: bytes) -> bool:
     return True
 
 
-def read(path: Path, wavelength_nm: float | None = None) -> BRDFSamples:
-    """Samples at one wavelength.
-
-    Parameters
-    ----------
-    path : Path
-    wavelength_nm : float, optional
-        The nearest one in the file is taken; 555 nm by default.
-    """
+def read(path: Path) -> ChannelSamples:
+    """Samples at every wavelength of the file."""
     values: list[float] = []
     counts: list[int] = []  # line of each number
     first = ""
@@ -60,31 +55,21 @@ def read(path: Path, wavelength_nm: float | None = None) -> BRDFSamples:
         raise DatasetError(
             f"{path}: {len(values)} numbers do not make rows of 4 angles and {n} values; the file is cut or of another kind"
         )
-    wavelengths = np.array(values[1 : 1 + n])
-    if np.any(wavelengths <= 0) or np.any(wavelengths > 1e6):
-        raise DatasetError(f"{path}, line {counts[1]}: a wavelength is not between 0 and 1e6 nm; the file is damaged")
-    rows = np.array(values[1 + n :]).reshape(-1, 4 + n)
-    chosen = int(np.argmin(np.abs(wavelengths - (wavelength_nm or PHOTOPIC_PEAK_NM))))
-    theta_i, phi_i, theta_r, phi_r = rows[:, :4].T
-    outside = np.any((rows[:, [0, 2]] < 0) | (rows[:, [0, 2]] > np.pi), axis=1) | np.any(
-        np.abs(rows[:, [1, 3]]) > 4 * np.pi, axis=1
-    )
-    if np.any(outside):
-        at = int(np.flatnonzero(outside)[0])
-        line_of_row = counts[1 + n + at * (4 + n)]
-        raise DatasetError(f"{path}, line {line_of_row}: an angle is beyond half a turn; angles must be in radians")
-    keep = (theta_i < np.pi / 2) & (theta_r < np.pi / 2)
-    if not np.any(keep):
-        raise DatasetError(f"{path} holds no sample above the horizon")
-    attributes = {
-        "quantity": "brdf",
-        "source_quantity": "brdf",
-        "source_format": "cornell",
-        "wavelength_nm": f"{wavelengths[chosen]:g}",
-        "n_wavelengths": str(n),
-        "n_below_horizon": str(int(np.count_nonzero(~keep))),
-    }
-    return BRDFSamples.plain(
-        theta_i[keep], np.mod(phi_i[keep], 2 * np.pi), theta_r[keep], np.mod(phi_r[keep], 2 * np.pi),
-        rows[keep, 4 + chosen], attributes=attributes,
-    )  # fmt: skip
+    channels = spectral(values[1 : 1 + n], f"{path}, line {counts[1]}")
+    table = np.array(values[1 + n :]).reshape(-1, 4 + n)
+    attributes = {"source_quantity": "brdf", "source_format": "cornell"}
+    return rows.samples(path, table[:, :4], table[:, 4:], channels, attributes, counts[1 + n :: 4 + n])
+
+
+def write(path: Path, found: ChannelSamples, attributes: Mapping[str, str] | None = None) -> None:
+    """Write samples; numbers come back bit for bit."""
+    rows.complete(path, found, "a Cornell file")
+    wavelengths = found.channels.wavelengths_nm or NOMINAL_NM[found.channels.kind]
+    out = ["# BRDF f_r [1/sr]; theta_i phi_i theta_r phi_r [rad]; mirror direction at phi_r = phi_i + pi"]
+    if found.channels.wavelengths_nm is None:
+        out.append(f"# channels {', '.join(found.channels.names)} at nominal wavelengths: they are not spectral")
+    out += [
+        f"# {rows.one_line(k)}: {rows.one_line(v)}" for k, v in sorted({**found.attributes, **(attributes or {})}.items())
+    ]
+    out += [str(len(wavelengths)), " ".join(map(repr, wavelengths)), ""]
+    rows.put(path, "\n".join(out) + rows.text(found, " "))

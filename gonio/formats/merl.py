@@ -7,7 +7,7 @@ pair below the horizon or one never measured.
 
 Written is the value at the lower edge of each bin: readers that interpolate take the edges for nodes, and readers that
 truncate are exact there. A bin whose edge is below the horizon, though part of it is above, holds the value at its centre
-or at its highest corner. gonio has one channel and writes it three times.
+or at its highest corner. A single channel is written three times.
 
 References
 ----------
@@ -18,7 +18,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,20 +25,15 @@ from numpy.typing import NDArray
 
 from gonio import files
 from gonio.brdf.base import BRDF
-from gonio.errors import ConfigurationError, DatasetError
+from gonio.channels import RGB, ChannelSamples
+from gonio.errors import DatasetError
+from gonio.formats.material import Material
 from gonio.halfdiff import directions
-from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
 SHAPE = (90, 90, 180)
 CELLS = 90 * 90 * 180
 SCALE = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
-CHANNELS: Mapping[str, tuple[float, float, float]] = {
-    "luminance": (0.2126, 0.7152, 0.0722),  # Rec. ITU-R BT.709, linear RGB
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-}
 HEADER = np.array(SHAPE, dtype="<i4").tobytes()
 SIZE = 12 + 3 * CELLS * 8
 DRAWS = 30_000  # bins looked at when a file is thinned to samples
@@ -50,51 +44,35 @@ def sniff(head: bytes) -> bool:
     return head[:12] == HEADER
 
 
-def read(path: Path, channel: str = "luminance") -> BRDFSamples:
-    """About 20 000 samples at lower bin edges, spread evenly over the table's coordinates by an R3 sequence [2]_.
+def read(path: Path) -> ChannelSamples:
+    """About 20 000 RGB samples at lower bin edges, spread evenly over the table's coordinates by an R3 sequence [2]_.
 
     Scattered bins rather than every n-th: a fit or a table learns more from them, and leave-one-out errors mean something.
-
-    Parameters
-    ----------
-    path : Path
-    channel : str
-        Key of `CHANNELS`.
-
-    Returns
-    -------
-    BRDFSamples
-        Without uncertainty (NaN), which the format cannot hold.
+    Without uncertainty (NaN), which the format cannot hold.
     """
-    weights = CHANNELS.get(channel)
-    if weights is None:
-        raise ConfigurationError(f"a MERL file has no channel {channel!r}; choose one of: {', '.join(CHANNELS)}")
     planes = read_planes(path)
     theta_h, theta_d, phi_d = edges()
     take = _scattered()
     h, d, p = theta_h[take[0]], theta_d[take[1]], phi_d[take[2]]  # (n,)
-    value, valid = np.zeros(h.shape), np.ones(h.shape, dtype=bool)
-    for plane, scale, weight in zip(planes, SCALE, weights, strict=True):
-        if weight:
-            stored = plane[tuple(take)]
-            valid &= stored >= 0
-            value += weight * scale * stored
+    stored = np.stack([plane[tuple(take)] for plane in planes], axis=-1)
+    value = np.where(stored >= 0, stored * np.array(SCALE), np.nan)
     omega_i, omega_r = directions(h, np.zeros_like(h), d, p)
     # bins whose edge lies below the horizon hold the value of another point of the bin
     above = (omega_i[..., 2] > 1e-3) & (omega_r[..., 2] > 1e-3)
-    keep = valid & above
+    valid = np.all(stored >= 0, axis=-1)
+    keep = above & np.any(stored >= 0, axis=-1)
     if not np.any(keep):
-        raise DatasetError(f"{path}: no value of channel {channel} is valid; the file holds no BRDF")
+        raise DatasetError(f"{path}: no value is valid; the file holds no BRDF")
     theta_i, theta_r = (np.arccos(np.clip(w[..., 2], -1, 1))[keep] for w in (omega_i, omega_r))
     phi_i, phi_r = (np.mod(np.arctan2(w[..., 1], w[..., 0]), 2 * np.pi)[keep] for w in (omega_i, omega_r))
     attributes = {
         "quantity": "brdf",
-        "source_quantity": f"brdf, {channel} of linear RGB",
+        "source_quantity": "brdf, linear RGB",
         "source_format": "merl",
         "n_missing": str(int(np.count_nonzero(above & ~valid))),
         "thinning": f"{np.count_nonzero(keep)} of {CELLS} bins, scattered evenly, at their lower edges",
     }
-    return BRDFSamples.plain(theta_i, phi_i, theta_r, phi_r, value[keep], attributes=attributes)
+    return ChannelSamples.make(theta_i, phi_i, theta_r, phi_r, value[keep], RGB, attributes=attributes)
 
 
 def read_planes(path: Path) -> Array:
@@ -121,18 +99,25 @@ def edges() -> tuple[Array, Array, Array]:
     return np.radians(k * k / 90.0), np.radians(k), np.radians(np.arange(180.0))
 
 
-def write(path: Path, brdf: BRDF) -> None:
-    """Write a BRDF, tabulated or not.
+def write(path: Path, material: Material) -> None:
+    """Write an isotropic material: linear RGB, or one channel three times.
 
     Raises
     ------
     DatasetError
-        If the file cannot be written or the BRDF has values that are not finite.
+        If the file cannot be written, the material has a grain, or its values are not finite.
     """
-    values = sampled(brdf)
-    if not np.all(np.isfinite(values)):
+    if not material.isotropic:
+        raise DatasetError(f"{path}: a MERL file holds isotropic BRDFs only; choose rgl, ssdd or a format of rows")
+    if material.channels.kind == "xyz":
+        raise DatasetError(f"{path}: a MERL file holds linear RGB, these data are X, Y, Z; export one channel")
+    if material.channels.kind != "rgb":
+        material = material.one()
+    planes = [sampled(brdf) for brdf in material.brdfs]
+    if not all(np.all(np.isfinite(plane)) for plane in planes):
         raise DatasetError(f"{path}: the BRDF is not finite everywhere, so no MERL file can be made from it")
-    stored = np.concatenate([np.where(values >= 0, values / scale, -1.0).ravel() for scale in SCALE])
+    pairs = zip(planes * (3 // len(planes)), SCALE, strict=True)
+    stored = np.concatenate([np.where(values >= 0, values / scale, -1.0).ravel() for values, scale in pairs])
 
     def put(temporary: Path) -> None:
         temporary.write_bytes(HEADER + stored.astype("<f8").tobytes())

@@ -1,12 +1,13 @@
 """Samples and tables as self-describing NetCDF-4, CF style: any netCDF or HDF5 tool shows what they are.
 
 One root group. Samples have the dimension ``sample``: ``theta_i``, ``phi_i``, ``theta_r``, ``phi_r`` [rad], ``brdf``
-[sr-1] with ``brdf_standard_error``, and the derivatives with respect to each shared error. A table has the dimensions
-``theta_h``, ``theta_d``, ``phi_d``: ``brdf_table`` with its standard error and coverage flags. Either or both may be
-present. CF has no standard name for a BRDF, so ``long_name`` says it. Numbers come back bit for bit.
+[sr-1] with ``brdf_standard_error``, and the derivatives with respect to each shared error. Several channels are a second
+dimension ``channel`` with ``channel_name`` and, for spectra, ``wavelength`` [nm]. A table has the dimensions ``theta_h``,
+``theta_d``, ``phi_d`` (and ``phi_h`` before them if it is anisotropic): ``brdf_table`` with its standard error and coverage
+flags. Either or both may be present. CF has no standard name for a BRDF, so ``long_name`` says it. Numbers come back bit for
+bit. docs/formats.md lists every variable.
 
-Files from outside are read with their declared sizes checked first; links to other files, virtual and external storage
-are refused.
+A file is opened by a child process under limits; see `gonio.formats.hdf5`.
 
 References
 ----------
@@ -15,10 +16,8 @@ References
 
 from __future__ import annotations
 
-import contextlib
 import json
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,15 +25,16 @@ import numpy as np
 
 import gonio
 from gonio import files
+from gonio.channels import Channels, ChannelSamples, from_names, spectral
 from gonio.errors import DatasetError
+from gonio.formats import hdf5
+from gonio.formats.hdf5 import Contents
 from gonio.samples import BRDFSamples, SharedError
 
 if TYPE_CHECKING:
     from gonio.brdf.tabulated import TabulatedBRDF
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
 CONVENTIONS = "CF-1.11 gonio-1"
-LARGEST_ARRAY = 2**30  # bytes, as declared
 BRDF_NAME = "bidirectional reflectance distribution function"
 FRAME = (
     "polar angles from the surface normal, azimuths counter-clockwise from the tangent; "
@@ -50,13 +50,13 @@ DIRECTIONS = {
 
 def sniff(head: bytes) -> bool:
     """The HDF5 signature."""
-    return head[:8] == SIGNATURE
+    return head[:8] == hdf5.SIGNATURE
 
 
 def write(
     path: Path,
     *,
-    samples: BRDFSamples | None = None,
+    samples: BRDFSamples | ChannelSamples | None = None,
     table: TabulatedBRDF | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
@@ -65,7 +65,7 @@ def write(
     Parameters
     ----------
     path : Path
-    samples : BRDFSamples, optional
+    samples : BRDFSamples or ChannelSamples, optional
     table : TabulatedBRDF, optional
     attributes : mapping of str to str, optional
         More about the file; ``history`` extends the file's own.
@@ -99,72 +99,111 @@ def write(
 
 def contents(path: Path) -> set[str]:
     """What the file holds: ``"samples"``, ``"table"`` or both."""
-    with _opened(path) as file:
-        return {kind for kind, name in (("samples", "brdf"), ("table", "brdf_table")) if name in file}
+    found = hdf5.read(path)
+    return {kind for kind, name in (("samples", "brdf"), ("table", "brdf_table")) if name in found.arrays}
+
+
+def read(path: Path) -> BRDFSamples | ChannelSamples | TabulatedBRDF:
+    """Samples if there are any, else the table."""
+    found = hdf5.read(path)
+    return _table(path, found) if "brdf" not in found.arrays and "brdf_table" in found.arrays else _samples(path, found)
 
 
 def read_samples(path: Path) -> BRDFSamples:
-    """Samples of a file that `write` made, or `DatasetError`."""
-    with _opened(path) as file:
-        _needed(path, file, "brdf", "samples")
-        arrays = {name: _array(path, file, name) for name in (*DIRECTIONS, "brdf", "brdf_standard_error")}
-        n = arrays["brdf"].shape[0] if arrays["brdf"].ndim == 1 else -1
-        for name, array in arrays.items():
-            if array.shape != (n,):
-                raise DatasetError(f"{path}: {name} has shape {array.shape}, brdf {arrays['brdf'].shape}; it is damaged")
-        shared: tuple[SharedError, ...] = ()
-        none = np.zeros((n, 3, 0))
-        d_omega_i, d_omega_r, d_ln_f = none, none, np.zeros((n, 0))
-        if "shared_error_u" in file:
-            u, u_sample = _array(path, file, "shared_error_u"), _array(path, file, "shared_error_u_sample")
-            names, units = _strings(path, file, "shared_error_name"), _strings(path, file, "shared_error_unit")
-            if not (u.ndim == 1 and u.shape == u_sample.shape and len(names) == len(units) == len(u)):
-                raise DatasetError(f"{path}: the shared errors have different lengths; the file is damaged")
-            shared = tuple(
-                SharedError(*row) for row in zip(names, u.tolist(), u_sample.tolist(), units, strict=True)
-            )
-            d_omega_i, d_omega_r = _array(path, file, "d_omega_i"), _array(path, file, "d_omega_r")
-            d_ln_f = _array(path, file, "d_ln_f")
-        pose = _array(path, file, "pose", kind="i") if "pose" in file else np.full(n, -1, dtype=np.int64)
-        attributes = _attributes(path, file["brdf"])
-    return BRDFSamples(
-        arrays["theta_i"], arrays["phi_i"], arrays["theta_r"], arrays["phi_r"], arrays["brdf"],
-        arrays["brdf_standard_error"], pose.astype(np.int64), shared, d_omega_i, d_omega_r, d_ln_f, attributes,
-    )  # fmt: skip
+    """Samples of one channel of a file that `write` made, or `DatasetError`."""
+    found = _samples(path, hdf5.read(path))
+    return found if isinstance(found, BRDFSamples) else found.channel()
 
 
 def read_table(path: Path) -> TabulatedBRDF:
     """Table of a file that `write` made, or `DatasetError`."""
+    return _table(path, hdf5.read(path))
+
+
+def _samples(path: Path, file: Contents) -> BRDFSamples | ChannelSamples:
+    _needed(path, file, "brdf", "samples")
+    arrays = {name: _array(path, file, name) for name in (*DIRECTIONS, "brdf", "brdf_standard_error")}
+    shape = arrays["brdf"].shape
+    n = shape[0] if shape else -1
+    for name, array in arrays.items():
+        expected = (n,) if name in DIRECTIONS else shape
+        if len(shape) not in (1, 2) or array.shape != expected:
+            raise DatasetError(f"{path}: {name} has shape {array.shape}, brdf {shape}; it is damaged")
+    attributes = _attributes(path, file, "brdf")
+    theta_i, phi_i, theta_r, phi_r = (arrays[name] for name in DIRECTIONS)
+    if len(shape) == 2:
+        channels = _channels(path, file)
+        if len(channels) != shape[1]:
+            raise DatasetError(f"{path}: {len(channels)} channels are named, brdf has {shape[1]}; the file is damaged")
+        u = arrays["brdf_standard_error"]
+        return ChannelSamples(theta_i, phi_i, theta_r, phi_r, arrays["brdf"], u, channels, attributes)
+    shared: tuple[SharedError, ...] = ()
+    none = np.zeros((n, 3, 0))
+    d_omega_i, d_omega_r, d_ln_f = none, none, np.zeros((n, 0))
+    if "shared_error_u" in file.arrays:
+        u, u_sample = _array(path, file, "shared_error_u"), _array(path, file, "shared_error_u_sample")
+        names, units = _texts_of(path, file, "shared_error_name"), _texts_of(path, file, "shared_error_unit")
+        if not (u.ndim == 1 and u.shape == u_sample.shape and len(names) == len(units) == len(u)):
+            raise DatasetError(f"{path}: the shared errors have different lengths; the file is damaged")
+        shared = tuple(SharedError(*row) for row in zip(names, u.tolist(), u_sample.tolist(), units, strict=True))
+        d_omega_i, d_omega_r = _array(path, file, "d_omega_i"), _array(path, file, "d_omega_r")
+        d_ln_f = _array(path, file, "d_ln_f")
+    pose = _array(path, file, "pose", kind="i") if "pose" in file.arrays else np.full(n, -1, dtype=np.int64)
+    try:
+        return BRDFSamples(
+            theta_i, phi_i, theta_r, phi_r, arrays["brdf"], arrays["brdf_standard_error"], pose.astype(np.int64), shared,
+            d_omega_i, d_omega_r, d_ln_f, attributes,
+        )  # fmt: skip
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}") from None
+
+
+def _channels(path: Path, file: Contents) -> Channels:
+    if "wavelength" in file.arrays:
+        return spectral(_array(path, file, "wavelength").ravel(), str(path))
+    return from_names(tuple(_texts_of(path, file, "channel_name")), str(path))
+
+
+def _table(path: Path, file: Contents) -> TabulatedBRDF:
     from gonio.brdf import tabulated
 
-    with _opened(path) as file:
-        _needed(path, file, "brdf_table", "table")
-        value = _array(path, file, "brdf_table")
-        u = _array(path, file, "brdf_table_standard_error")
-        coverage = _array(path, file, "brdf_table_coverage", kind="iu")
-        tabulated.check_shape(value.shape)
-        for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape), strict=True):
-            axis = _array(path, file, name)
-            if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
-                raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
-        attributes = _attributes(path, file["brdf_table"])
+    _needed(path, file, "brdf_table", "table")
+    value = _array(path, file, "brdf_table")
+    u = _array(path, file, "brdf_table_standard_error")
+    coverage = _array(path, file, "brdf_table_coverage", kind="iu")
+    tabulated.check_shape(value.shape)
+    for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape), strict=True):
+        axis = _array(path, file, name)
+        if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
+            raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
+    attributes = _attributes(path, file, "brdf_table")
     if np.any((coverage < 0) | (coverage > 255)):
         raise DatasetError(f"{path}: a coverage flag is outside 0 to 255; the file is damaged")
     return tabulated.TabulatedBRDF(value, u, coverage.astype(np.uint8), attributes)
 
 
-def _put_samples(file: Any, samples: BRDFSamples) -> None:
+def _put_samples(file: Any, samples: BRDFSamples | ChannelSamples) -> None:
     file.dimensions["sample"] = len(samples)
+    dimensions: tuple[str, ...] = ("sample",)
+    if isinstance(samples, ChannelSamples):
+        dimensions = ("sample", "channel")
+        file.dimensions["channel"] = len(samples.channels)
+        _texts(file, "channel_name", ("channel",), list(samples.channels.names), long_name="name of the channel")
+        if samples.channels.wavelengths_nm is not None:
+            waves = np.array(samples.channels.wavelengths_nm)
+            _variable(file, "wavelength", ("channel",), waves, long_name="radiation wavelength", units="nm")
     for name, long_name in DIRECTIONS.items():
         _variable(file, name, ("sample",), getattr(samples, name), long_name=long_name, units="rad")
     _variable(
-        file, "brdf", ("sample",), samples.f_r, long_name=BRDF_NAME, units="sr-1", coordinates=" ".join(DIRECTIONS),
+        file, "brdf", dimensions, samples.f_r, long_name=BRDF_NAME, units="sr-1", coordinates=" ".join(DIRECTIONS),
         ancillary_variables="brdf_standard_error", gonio_attributes=json.dumps(dict(samples.attributes), sort_keys=True),
     )  # fmt: skip
     _variable(
-        file, "brdf_standard_error", ("sample",), samples.u_f_r, long_name=f"standard uncertainty of the {BRDF_NAME}",
+        file, "brdf_standard_error", dimensions, samples.u_f_r, long_name=f"standard uncertainty of the {BRDF_NAME}",
         units="sr-1", comment="random errors only, k = 1; NaN where unknown",
     )  # fmt: skip
+    if isinstance(samples, ChannelSamples):
+        return
     _variable(file, "pose", ("sample",), samples.pose, long_name="pose of the scan, -1 if none")
     if samples.shared:
         file.dimensions["shared_error"] = len(samples.shared)
@@ -230,62 +269,35 @@ def _texts(file: Any, name: str, dimensions: tuple[str, ...], texts: list[str], 
         variable.attrs[key] = value
 
 
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """The file under h5py; whatever a damaged file makes the library raise becomes a `DatasetError`."""
-    files.size_of(path)
-    if not sniff(files.head(path, 8)):
-        raise DatasetError(f"{path} is no NetCDF-4 file: the HDF5 signature is missing")
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as error:
-        raise DatasetError(f"{path} is a damaged NetCDF-4 file ({files.shown(str(error), 120)}); make it again") from error
-
-
-def _needed(path: Path, file: Any, name: str, kind: str) -> None:
-    if name not in file:
+def _needed(path: Path, file: Contents, name: str, kind: str) -> None:
+    if name in file.others:
+        raise DatasetError(f"{path}: {name} holds {file.others[name]}, which gonio does not write; the file is damaged")
+    if name not in file.arrays and name not in file.texts:
         raise DatasetError(f"{path} holds no {kind} (variable {name}); make it with `gonio export` or `gonio table`")
 
 
-def _dataset(path: Path, file: Any, name: str) -> Any:
-    import h5py
-
+def _array(path: Path, file: Contents, name: str, kind: str = "f") -> np.ndarray:
     _needed(path, file, name, name)
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise DatasetError(f"{path}: {name} is a link to another file, which is refused; copy the data into one file")
-    data = file[name]
-    if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
-        raise DatasetError(f"{path}: {name} is not stored in this file; copy the data into one file")
-    return data
+    data = file.arrays.get(name)
+    if data is None or data.dtype.kind not in kind or data.ndim > 4:
+        shown = "texts" if data is None else f"{data.ndim} dimensions of {data.dtype}"
+        raise DatasetError(f"{path}: {name} has {shown}, which gonio does not write; the file is damaged")
+    return data.astype(float) if kind == "f" else data
 
 
-def _array(path: Path, file: Any, name: str, kind: str = "f") -> np.ndarray:
-    data = _dataset(path, file, name)
-    if data.dtype.kind not in kind or data.ndim > 3:
-        raise DatasetError(f"{path}: {name} has {data.ndim} dimensions of {data.dtype}, which gonio does not write")
-    declared = math.prod(int(n) for n in data.shape) * data.dtype.itemsize
-    if declared > LARGEST_ARRAY:
-        raise DatasetError(f"{path}: {name} declares {declared} bytes, at most {LARGEST_ARRAY} are read")
-    array = np.asarray(data[()])
-    return array.astype(float) if kind == "f" else array
-
-
-def _strings(path: Path, file: Any, name: str) -> list[str]:
-    data = _dataset(path, file, name)
-    if data.ndim != 1 or data.shape[0] > 1000 or data.dtype.kind not in "OS":
+def _texts_of(path: Path, file: Contents, name: str) -> list[str]:
+    _needed(path, file, name, name)
+    if name not in file.texts:
         raise DatasetError(f"{path}: {name} is no list of names; the file is damaged")
-    return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in data[()]]
+    return file.texts[name]
 
 
-def _attributes(path: Path, variable: Any) -> dict[str, str]:
-    text = variable.attrs.get("gonio_attributes", "{}")
+def _attributes(path: Path, file: Contents, name: str) -> dict[str, str]:
+    text = file.attributes[name].get("gonio_attributes", "{}")
     try:
-        found = json.loads(str(text))
+        found = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: the attribute gonio_attributes is not JSON; the file is damaged") from error
     if not isinstance(found, dict):
         raise DatasetError(f"{path}: the attribute gonio_attributes is no mapping; the file is damaged")
-    return {str(name): str(value) for name, value in found.items()}
+    return {str(k): str(v) for k, v in found.items()}

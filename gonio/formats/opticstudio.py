@@ -1,14 +1,12 @@
-"""OpticStudio (Zemax) tabular ``.bsdf``: scatter around the specular direction, read only.
+"""OpticStudio (Zemax) tabular ``.bsdf``: scatter around the specular direction.
 
 A header of keywords with counts and angles in degrees, then ``DataBegin``, one block for each sample rotation and angle
 of incidence (``TIS`` and a row for each scatter azimuth with a column for each radial angle), and ``DataEnd``. Keywords are
-matched without case, as programs differ. Angles are relative to the specular direction: radial 0 is specular, azimuth 0
-runs from specular towards the normal, counter-clockwise seen against the specular ray. Sample rotation turns the sample
-under a fixed light, so azimuths on the sample fall as it grows.
+matched without case, as programs differ. `gonio.formats.specular` says how the angles run.
 
-An exact 0 stands for directions below the horizon and for directions that were never measured; both are left out and
-counted. All azimuths of radial 0 are one direction and give one sample. Transmission is refused, and of the three
-tristimulus blocks only Y is read. The file has no uncertainties: u_f_r is NaN.
+An exact 0 stands for directions below the horizon and for directions that were never measured; both are left out of the
+samples and counted, and are written back as 0. All azimuths of radial 0 are one direction and give one sample. Transmission
+is refused. The file has no uncertainties: u_f_r is NaN.
 
 References
 ----------
@@ -18,19 +16,22 @@ References
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from gonio import files
+from gonio.channels import SINGLE, XYZ, ChannelSamples
 from gonio.errors import DatasetError
-from gonio.geometry import angles
-from gonio.samples import BRDFSamples
+from gonio.formats import rows, specular
+from gonio.formats.material import INCIDENCES_DEG, Material
+from gonio.formats.specular import SpecularTable
 
 LISTS = {"samplerotation": 720, "angleofincidence": 1000, "scatterazimuth": 3600, "scatterradial": 3600}
 WORDS = ("source", "symmetry", "spectralcontent", "scattertype")
 SYMMETRIES = ("planesymmetrical", "asymmetrical", "asymmetrical4d")
+COLOURS = ("tristimulusx", "tristimulusy", "tristimulusz")
 Words = tuple[int, list[str]]
 
 
@@ -40,65 +41,94 @@ def sniff(head: bytes) -> bool:
     return "angleofincidence" in words and bool(words & {"symmetry", "spectralcontent", "scattertype", "scatterradial"})
 
 
-def read(path: Path) -> BRDFSamples:
-    """Samples at the measured directions above the horizon.
+def read(path: Path) -> ChannelSamples:
+    """Samples at the measured directions above the horizon."""
+    table = read_table(path)
+    try:
+        return table.samples()
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}") from None
+
+
+def read_table(path: Path) -> SpecularTable:
+    """The file's own grid.
 
     Raises
     ------
     DatasetError
         With the line, if the file is damaged, too large, or holds transmission.
     """
-    words = _words(files.read_lines(path))
-    header, lists = _header(path, words)
-    rotation, incidence = lists["samplerotation"], lists["angleofincidence"]
-    azimuth, radial = lists["scatterazimuth"], lists["scatterradial"]
-    _check_angles(path, incidence, azimuth, radial, header["symmetry"])
-    cells = len(rotation) * len(incidence) * len(azimuth) * len(radial)
+    lines = files.read_lines(path)
+    words = _words(lines)
+    header, lists, block = _header(path, words)
+    angles = {name: np.array(values) for name, values in lists.items()}
+    _check_angles(path, lists, header["symmetry"])
+    shape = tuple(len(lists[name]) for name in ("samplerotation", "angleofincidence", "scatterazimuth", "scatterradial"))
+    colours = COLOURS if block in COLOURS else (block,)
+    cells = int(np.prod(shape)) * len(colours)
     if 2 * cells > files.size_of(path):
         raise DatasetError(f"{path}: the header announces {cells} values, more than its bytes can hold; it is cut")
-    blocks = _blocks(path, words, len(rotation) * len(incidence), len(azimuth), len(radial))
-    data, tis = blocks
-
-    # specular direction s, e_1 from s towards the normal, e_2 = s x e_1; light at azimuth 0, mirror side at 180 degrees
-    a = np.radians(np.array(incidence))[:, None, None]
-    az, r = np.radians(np.array(azimuth))[:, None], np.radians(np.array(radial))
-    along = np.cos(az) * np.sin(r)
-    x = -np.sin(a) * np.cos(r) + np.cos(a) * along
-    y = np.broadcast_to(np.sin(az) * np.sin(r), x.shape)
-    z = np.cos(a) * np.cos(r) + np.sin(a) * along
-    theta_r, phi_r = angles(np.stack((x, y, z), axis=-1))  # (incidence, azimuth, radial)
-    turn = -np.radians(np.array(rotation))[:, None, None, None]  # the sample turns under fixed light
-    shape = (len(rotation), *x.shape)
-    values = data.reshape(shape)
-    one = np.ones(x.shape, dtype=bool)
-    one[:, 1:, np.array(radial) == 0.0] = False  # the specular direction, once
-    above = np.broadcast_to((z > 1e-9) & one, shape)
-    measured = above & (values != 0.0)
-    if not np.any(measured):
-        raise DatasetError(f"{path}: all values above the horizon are 0, which means never measured; the file is empty")
-
-    def picked(array: np.ndarray) -> np.ndarray:
-        return np.asarray(np.broadcast_to(array, shape)[measured])
-
+    data, tis = [], []
+    for k, colour in enumerate(colours):
+        if k:
+            _expect(path, words, colour)
+            _expect(path, words, "databegin")
+        found, scatter = _blocks(path, words, shape[0] * shape[1], shape[2], shape[3])
+        data.append(found.reshape(shape))
+        tis.append(np.array(scatter).reshape(shape[:2]))
     attributes = {
         "quantity": "brdf",
         "source_quantity": "brdf",
         "source_format": "opticstudio",
         "symmetry": header["symmetry"],
         "spectral_content": header["spectralcontent"],
-        "directions": "specular-relative in the file, converted to polar angle and azimuth from the normal",
-        "n_above_horizon": str(int(np.count_nonzero(above))),
-        "n_missing": str(int(np.count_nonzero(above & ~measured))),
-        "missing": "an exact 0 marks a direction that was never measured",
-        "total_integrated_scatter": ", ".join(f"{t:g}" for t in tis[:100]),
     }
-    comment = _sample_name(files.read_lines(path))
-    if comment:
-        attributes["material"] = comment
-    return BRDFSamples.plain(
-        picked(a), np.mod(picked(turn), 2 * np.pi), picked(theta_r), np.mod(picked(phi_r + turn), 2 * np.pi),
-        values[measured], attributes=attributes,
+    comments = tuple(itertools.takewhile(lambda line: line.startswith("#") or not line.strip(), lines[:500]))
+    name = _sample_name(comments)
+    if name:
+        attributes["material"] = name
+    return SpecularTable(
+        angles["samplerotation"], angles["angleofincidence"], angles["scatterazimuth"], angles["scatterradial"],
+        np.stack(data), np.stack(tis), header["symmetry"] == "planesymmetrical", XYZ if len(colours) == 3 else SINGLE,
+        comments, attributes,
     )  # fmt: skip
+
+
+def write(path: Path, material: Material, attributes: Mapping[str, str] | None = None) -> None:
+    """Write a material at nine incidences; linear RGB as X, Y, Z, of a spectrum the channel nearest to 555 nm."""
+    table = specular.tabulate(material, np.array(INCIDENCES_DEG))
+    told = {**material.attributes, **(attributes or {})}
+    name = material.channels.names[material.channels.main] if material.channels.kind == "spectral" else ""
+    comments = ["# BRDF f_r [1/sr]; angles [deg] relative to the specular direction, azimuth 0 towards the normal"]
+    comments += [f"# channel: {name}"] if name else []
+    comments += [f"# {rows.one_line(k)}: {rows.one_line(v)}" for k, v in sorted(told.items()) if k != "material"]
+    if "material" in told:
+        comments.append(f"# Sample: {rows.one_line(told['material'], 200)}")
+    write_table(path, table, tuple(comments))
+
+
+def write_table(path: Path, table: SpecularTable, comments: tuple[str, ...] | None = None) -> None:
+    """Write a table; what `read_table` gave comes back number for number."""
+    kind = "PlaneSymmetrical" if table.symmetric else "Asymmetrical4D" if len(table.rotation_deg) > 1 else "Asymmetrical"
+    out = [rows.one_line(line) for line in (table.comments if comments is None else comments)]
+    out += [
+        "Source\tMeasured",
+        f"Symmetry\t{kind}",
+        f"SpectralContent\t{'XYZ' if len(table.channels) == 3 else 'Monochrome'}",
+    ]
+    out.append("ScatterType\tBRDF")
+    lists = (table.rotation_deg, table.incidence_deg, table.azimuth_deg, table.radial_deg)
+    for name, values in zip(("SampleRotation", "AngleOfIncidence", "ScatterAzimuth", "ScatterRadial"), lists, strict=True):
+        out += [f"{name}\t{len(values)}", "\t".join(f"{v:.15g}" for v in values)]
+    for k in range(len(table.channels)):
+        out += ["", ("TristimulusX", "TristimulusY", "TristimulusZ")[k] if len(table.channels) == 3 else "Monochrome"]
+        out.append("DataBegin")
+        for rotation in range(len(table.rotation_deg)):
+            for incidence in range(len(table.incidence_deg)):
+                out.append(f"TIS\t{float(table.tis[k, rotation, incidence])!r}")
+                out += ["\t".join(map(repr, row)) for row in table.value[k, rotation, incidence].tolist()]
+        out.append("DataEnd")
+    rows.put(path, "\n".join(out) + "\n")
 
 
 def _words(lines: list[str]) -> Iterator[Words]:
@@ -108,11 +138,11 @@ def _words(lines: list[str]) -> Iterator[Words]:
             yield count, words
 
 
-def _header(path: Path, words: Iterator[Words]) -> tuple[dict[str, str], dict[str, list[float]]]:
-    """Everything up to ``DataBegin``."""
+def _header(path: Path, words: Iterator[Words]) -> tuple[dict[str, str], dict[str, list[float]], str]:
+    """Everything up to the first ``DataBegin``: words, lists, and the name of the first block."""
     header = {"symmetry": "", "spectralcontent": "monochrome", "scattertype": "brdf", "source": ""}
     lists: dict[str, list[float]] = {}
-    block = ""
+    block = "monochrome"
     for count, line in words:
         where, keyword = f"{path}, line {count}", line[0].lower()
         if keyword == "databegin":
@@ -128,10 +158,9 @@ def _header(path: Path, words: Iterator[Words]) -> tuple[dict[str, str], dict[st
                 raise DatasetError(
                     f"{path}: ScatterType is {files.shown(header['scattertype'])}; gonio reads reflection (BRDF) only"
                 )
-            if block in ("tristimulusx", "tristimulusz"):
-                _skip_to(path, words, "tristimulusy")
-                _skip_to(path, words, "databegin")
-            return header, lists
+            if block in COLOURS[1:]:
+                raise DatasetError(f"{where}: the colour blocks begin with {files.shown(block)}; TristimulusX comes first")
+            return header, lists, block
         if keyword in LISTS:
             if len(line) != 2 or keyword in lists:
                 raise DatasetError(f"{where}: {line[0]} must stand once, with the number of its angles; correct the line")
@@ -145,7 +174,7 @@ def _header(path: Path, words: Iterator[Words]) -> tuple[dict[str, str], dict[st
             lists[keyword] = values
         elif keyword in WORDS:
             header[keyword] = line[1].lower() if len(line) > 1 else ""
-        elif keyword == "monochrome" or keyword.startswith("tristimulus"):
+        elif keyword in ("monochrome", *COLOURS):
             block = keyword
         else:
             raise DatasetError(f"{where}: unknown keyword {files.shown(line[0])}; an OpticStudio BSDF header is expected")
@@ -181,16 +210,21 @@ def _next(path: Path, words: Iterator[Words], wanted: str) -> Words:
     return found
 
 
-def _skip_to(path: Path, words: Iterator[Words], keyword: str) -> None:
-    while _next(path, words, keyword)[1][0].lower() != keyword:
-        pass
+def _expect(path: Path, words: Iterator[Words], keyword: str) -> None:
+    line, found = _next(path, words, keyword)
+    if found[0].lower() != keyword:
+        raise DatasetError(
+            f"{path}, line {line}: {files.shown(found[0])} where {keyword} is expected; a colour block is missing"
+        )
 
 
-def _check_angles(path: Path, incidence: list[float], azimuth: list[float], radial: list[float], symmetry: str) -> None:
+def _check_angles(path: Path, lists: dict[str, list[float]], symmetry: str) -> None:
+    azimuth = lists["scatterazimuth"]
     for name, values, low, high in (
-        ("AngleOfIncidence", incidence, 0.0, 90.0),
+        ("SampleRotation", lists["samplerotation"], -360.0, 360.0),
+        ("AngleOfIncidence", lists["angleofincidence"], 0.0, 90.0),
         ("ScatterAzimuth", azimuth, 0.0, 360.0),
-        ("ScatterRadial", radial, 0.0, 180.0),
+        ("ScatterRadial", lists["scatterradial"], 0.0, 180.0),
     ):
         if min(values) < low or max(values) > high or (name == "AngleOfIncidence" and max(values) >= high):
             raise DatasetError(
@@ -204,10 +238,10 @@ def _check_angles(path: Path, incidence: list[float], azimuth: list[float], radi
         )
 
 
-def _sample_name(lines: list[str]) -> str:
+def _sample_name(comments: tuple[str, ...]) -> str:
     """What the comments call the sample."""
-    for line in lines[:200]:
+    for line in comments:
         name, colon, text = line.lstrip("# \t").partition(":")
-        if line.startswith("#") and colon and name.strip().lower() == "sample":
+        if colon and name.strip().lower() == "sample":
             return "".join(c for c in text.strip() if c.isprintable())[:200]
     return ""

@@ -65,7 +65,7 @@ def random_samples(n: int = 400) -> BRDFSamples:
 def test_csv_round_trip_is_exact_and_repeatable(tmp_path: Path) -> None:
     samples = random_samples()
     csv.write(tmp_path / "a.csv", samples)
-    back = csv.read(tmp_path / "a.csv")
+    back = csv.read(tmp_path / "a.csv").channel()
     for name in ("theta_i", "phi_i", "theta_r", "phi_r", "f_r", "u_f_r"):
         np.testing.assert_array_equal(getattr(back, name), getattr(samples, name))
     csv.write(tmp_path / "b.csv", back)
@@ -210,7 +210,9 @@ def test_opticstudio_colour_reads_y(tmp_path: Path) -> None:
     body = text[text.index("DataBegin") :]
     y = body.replace("TIS 0.1\n1 2 3", "TIS 0.1\n1 2 33")
     text = text.replace("Monochrome\n" + body, f"TristimulusX\n{body}TristimulusY\n{y}TristimulusZ\n{body}")
-    assert 33 in formats.read_samples(put(tmp_path, text)).f_r
+    found = formats.read_channels(put(tmp_path, text))
+    assert found.channels.names == ("X", "Y", "Z") and 33 in formats.read_samples(tmp_path / "file.txt").f_r
+    assert 33 not in found.channel("X").f_r
 
 
 BAD_BSDF: list[tuple[Callable[[str], str], str]] = [
@@ -254,7 +256,7 @@ def test_cornell_rows_in_free_format(tmp_path: Path) -> None:
     np.testing.assert_array_equal(samples.theta_r, [0.7, 0.3])
     assert samples.attributes["wavelength_nm"] == "550"
     assert samples.attributes["n_below_horizon"] == "1"
-    np.testing.assert_array_equal(cornell.read(tmp_path / "file.txt", wavelength_nm=700).f_r, [0.3, 0.6])
+    np.testing.assert_array_equal(formats.read_samples(tmp_path / "file.txt", channel="650nm").f_r, [0.3, 0.6])
 
 
 @pytest.mark.parametrize(

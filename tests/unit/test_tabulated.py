@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import gonio
+from gonio import formats
 from gonio.brdf import scattered, tabulated
 from gonio.brdf.tabulated import SHAPE, TabulatedBRDF, from_brdf, node_directions, nodes, tabulate
 from gonio.errors import DatasetError
-from gonio.formats import opticstudio
 from gonio.halfdiff import half_difference
 from gonio.samples import BRDFSamples
 
@@ -187,7 +187,7 @@ def test_unknown_uncertainty_is_taken_from_the_scatter() -> None:
 
 def test_real_measurement_predicts_what_was_held_out() -> None:
     """Anodised black, four incidences, no uncertainties in the file."""
-    samples = opticstudio.read(REAL)
+    samples = formats.read_samples(REAL)
     out = np.random.default_rng(6).random(len(samples)) < 0.1
     table = tabulate(samples.select(~out))
     rest = samples.select(out)
