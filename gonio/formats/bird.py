@@ -1,11 +1,12 @@
 """BiRD universal BRDF data format: JSON with metadata, four angles, BRDF and its uncertainty per row.
 
 The only open format of measured BRDFs with an uncertainty at each point. ``data`` holds parallel arrays ``theta_i``,
-``phi_i``, ``theta_r``, ``phi_r``, ``BRDF`` and perhaps ``uBRDF`` and ``wavelength_i``, each with its unit. Spectral rows are
-put together where the directions agree, and two orthogonal incident polarisations are averaged, which is f_r of unpolarised
-light; other states that change from row to row are refused, as rows would be mixed unseen. Written are angles in radians, BRDF and uBRDF in sr^-1. The format has no negative BRDF: such rows are left out and
-their number stands in the comment. uBRDF is written if it is known for all rows. Channels without a wavelength are an
-ad hoc variable ``channel``.
+``phi_i``, ``theta_r``, ``phi_r``, ``BRDF`` and perhaps ``uBRDF`` and ``wavelength_i``, each with its unit. Spectral rows
+are put together where the directions agree, and two orthogonal incident polarisations are averaged, which is f_r of
+unpolarised light; other states that change from row to row are refused, as rows would be mixed unseen. Written are angles
+in radians, BRDF and uBRDF in sr^-1. The format has no negative BRDF: such rows are left out and their number stands in
+the comment. uBRDF is written if it is known for all rows. Channels without a wavelength are an ad hoc variable
+``channel``.
 
 References
 ----------

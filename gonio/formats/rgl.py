@@ -4,10 +4,10 @@ A tensor file whose value table is :math:`f_r\cos\theta_r`, divided by ndf/(4 si
 a square that a warp (``vndf``) maps to half vectors: :math:`u_\theta=\sqrt{2\theta_h/\pi}`,
 :math:`u_\phi=(\phi_h-\phi_i+\pi)/2\pi`; in anisotropic files, which have more than two ``phi_i``, the azimuth is absolute.
 
-Written is the identity warp, with ``ndf = 4``, ``sigma = 1`` and ``jacobian = 1``, which every reader takes the same way, even
-those that ignore the flag: the table is :math:`f_r\cos\theta_r` itself on a regular grid, 0 where a direction is below the
-horizon. ``luminance`` is the density by which Mitsuba samples. Values are float32. One channel is written as three equal
-ones.
+Written is the identity warp, with ``ndf = 4``, ``sigma = 1`` and ``jacobian = 1``, which every reader takes the same way,
+even those that ignore the flag: the table is :math:`f_r\cos\theta_r` itself on a regular grid, 0 where a direction is
+below the horizon. ``luminance`` is the density by which Mitsuba samples. Values are float32. One channel is written as
+three equal ones.
 
 Read is any such file: samples stand at the warped grid nodes. Real files hold negative RGB (out of gamut) and are
 reciprocal to some 10 % only; nothing is mended here.

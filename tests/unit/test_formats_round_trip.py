@@ -131,8 +131,8 @@ def test_bird_keeps_uncertainties(tmp_path: Path) -> None:
 def test_rgl_with_a_warp_of_its_own(tmp_path: Path) -> None:
     """A file whose vndf is not flat: values must stand at the half vectors that the density's inverse gives.
 
-    The density 2 x on the unit square, tabulated bilinearly, has the inverse x = sqrt(s); values are cos(theta_h), a function of
-    the half vector only, so they can be checked where they are read.
+    The density 2 x on the unit square, tabulated bilinearly, has the inverse x = sqrt(s); values are cos(theta_h), a
+    function of the half vector only, so they can be checked where they are read.
     """
     material = materials.single()
     formats.export("rgl", tmp_path / "a.bsdf", material=material)
