@@ -36,7 +36,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests import independent_lobes
+from tests import independent_diffuse, independent_facets, independent_lobes, independent_sources
+from tests.independent_pairs import from_angles, from_vectors
+from tests.independent_sources import axis, radiance, towards
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
@@ -114,11 +116,16 @@ class Surface:
         self.mirror = self.cos_r * self.normal + self.sin_r * self.tangent
 
 
+def _others(term: dict[str, Any]) -> Any:
+    """The module that has the term's model, None if it is one of those here."""
+    return next((m for m in (independent_lobes, independent_diffuse, independent_facets) if m.knows(term)), None)
+
+
 def _by_angles(term: dict[str, Any], surface: Surface, theta_i: Array, u: Array) -> Array:
     """f_r for incident polar angle theta_i and azimuth u counted from the mirror direction."""
     model = term["model"]
-    if model in independent_lobes.MODELS:
-        return independent_lobes.by_angles(term, surface, theta_i, u)
+    if (others := _others(term)) is not None:
+        return others.value(term, from_angles(surface, theta_i, u))
     si, ci, sr, cr = np.sin(theta_i), np.cos(theta_i), surface.sin_r, surface.cos_r
     if model == "lambertian":
         return np.full(np.broadcast(theta_i, u).shape, term["albedo"] / math.pi)
@@ -148,8 +155,9 @@ def _by_angles(term: dict[str, Any], surface: Surface, theta_i: Array, u: Array)
 def _by_vectors(term: dict[str, Any], surface: Surface, w: Array) -> Array:
     """f_r for unit vectors w (n, 3), viewer's coordinates; the viewer is (0, 0, 1)."""
     model = term["model"]
-    if model in independent_lobes.MODELS:
-        return independent_lobes.by_vectors(term, surface, w)
+    if (others := _others(term)) is not None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.where(w @ surface.normal > 0, others.value(term, from_vectors(surface, w)), 0.0)
     mu_i, mu_r = w @ surface.normal, surface.cos_r
     if model == "lambertian":
         return np.full(len(w), term["albedo"] / math.pi)
@@ -172,43 +180,6 @@ def _by_vectors(term: dict[str, Any], surface: Surface, w: Array) -> Array:
     t, b = w @ surface.tangent, w @ surface.binormal
     root_i, root_r = np.sqrt(mu_i**2 + a2 * (t**2 + b**2)), math.sqrt(mu_r**2 + a2 * surface.sin_r**2)
     return term["k_s"] * fresnel * d / (2 * (mu_r * root_i + mu_i * root_r))
-
-
-# --- sources ----------------------------------------------------------------------------------------------------------
-
-
-def _towards(theta: float, phi: float) -> Array:
-    return np.array([math.sin(theta) * math.cos(phi), math.sin(theta) * math.sin(phi), math.cos(theta)])
-
-
-def _axis(part: dict[str, Any]) -> Array:
-    if "theta" in part:
-        return _towards(part["theta"], part["phi"])
-    axis = np.array(part.get("axis", (0.0, 0.0, 1.0)), dtype=float)
-    return axis / np.linalg.norm(axis)
-
-
-def _radiance(part: dict[str, Any], w: Array) -> Array:
-    """Radiance from unit vectors w (n, 3), taken as inside the source's clip."""
-    kind = part["kind"]
-    if kind in ("uniform", "hemispherical", "disk"):
-        return np.full(len(w), float(part["radiance"]))
-    if kind == "overcast":
-        return part["zenith_radiance"] * (1 + 2 * (w @ _axis(part))) / 3
-    if kind == "lobes":
-        off = w - _axis(part)  # mu.w - 1 = -|w - mu|^2 / 2
-        return part["amplitude"] * np.exp(-0.5 * part["kappa"] * np.sum(off**2, axis=1))
-    assert kind == "environment_map"
-    table = np.array(part["radiance"], dtype=float)
-    rows, columns = table.shape
-    theta = np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2])
-    x = np.clip(theta * rows / math.pi - 0.5, 0, rows - 1)
-    y = np.mod(np.arctan2(w[:, 1], w[:, 0]), 2 * math.pi) * columns / (2 * math.pi) - 0.5
-    i, j = np.minimum(x.astype(int), rows - 2), np.floor(y).astype(int)
-    x, y = x - i, y - j
-    left, right = j % columns, (j + 1) % columns
-    above = (1 - y) * table[i, left] + y * table[i, right]
-    return (1 - x) * above + x * ((1 - y) * table[i + 1, left] + y * table[i + 1, right])
 
 
 # --- circles, rings and the nested integral ---------------------------------------------------------------------------
@@ -270,9 +241,7 @@ class _Rings:
 
     def directions(self, t: Array, chi: Array) -> Array:
         s = np.sin(t)
-        return (
-            (s * np.cos(chi))[:, None] * self.e1 + (s * np.sin(chi))[:, None] * self.e2 + np.cos(t)[:, None] * self.e3
-        )
+        return (s * np.cos(chi))[:, None] * self.e1 + (s * np.sin(chi))[:, None] * self.e2 + np.cos(t)[:, None] * self.e3
 
     def breaks(self) -> Array:
         """Rings where the integrand of t is not smooth, from 0 to pi."""
@@ -378,20 +347,11 @@ class _Rings:
 
 def _arrange(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> _Arrangement:
     found = _Arrangement([(surface.normal, HALF_PI, True)])
-    if part["kind"] in ("hemispherical", "overcast"):
-        found.circles.append((_axis(part), HALF_PI, True))
-    elif part["kind"] == "disk":
-        found.circles.append((_axis(part), part["half_angle"], True))
-    elif part["kind"] == "lobes":
-        found.features.append((_axis(part), 1 / math.sqrt(max(1.0, part["kappa"]))))
-    elif part["kind"] == "environment_map":
-        rows, columns = np.shape(part["radiance"])
-        found.circles += [(_towards(0.0, 0.0), (i + 0.5) * math.pi / rows, False) for i in range(rows)]
-        middles = {round(((j + 0.5) * 2 / columns) % 1.0, 12) for j in range(columns)}  # opposite ones share a plane
-        found.circles += [(_towards(HALF_PI, m * math.pi + HALF_PI), HALF_PI, False) for m in sorted(middles)]
-    if term["model"] in independent_lobes.MODELS:
-        found.features += independent_lobes.features(term, surface)
-        found.circles += independent_lobes.circles(term, surface)
+    found.circles += independent_sources.circles(part)
+    found.features += independent_sources.features(part)
+    if (others := _others(term)) is not None:
+        found.features += others.features(term, surface)
+        found.circles += others.circles(term, surface)
     elif term["model"] == "ggx":
         found.features.append((surface.mirror, term["alpha"]))
     elif term["model"] == "phong":
@@ -404,16 +364,16 @@ def _arrange(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> _A
 
 def _pole(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> Array:
     """A pole that is not the normal: what is narrowest, else the source's axis, else any direction."""
-    narrow = [(1 / math.sqrt(part["kappa"]), _axis(part))] if part["kind"] == "lobes" and part["kappa"] > 1 else []
+    narrow = [(1 / math.sqrt(part["kappa"]), axis(part))] if part["kind"] == "lobes" and part["kappa"] > 1 else []
     if part["kind"] == "disk":
-        narrow.append((part["half_angle"], _axis(part)))
-    if term["model"] in independent_lobes.MODELS:
-        narrow += [(2 * width, direction) for direction, width in independent_lobes.features(term, surface)]
+        narrow.append((part["half_angle"], axis(part)))
+    if (others := _others(term)) is not None:
+        narrow += [(2 * width, direction) for direction, width in others.features(term, surface)]
     if term["model"] == "ggx":
         narrow.append((2 * term["alpha"], surface.mirror))
     if term["model"] == "phong":
         narrow.append((2 / math.sqrt(max(1.0, term["n"])), surface.mirror))
-    narrow = [(w, d) for w, d in narrow if w < 0.5] + [(1.0, _axis(part)), (2.0, _towards(1.1, 0.4))]
+    narrow = [(w, d) for w, d in narrow if w < 0.5] + [(1.0, axis(part)), (2.0, towards(1.1, 0.4))]
     for _, direction in sorted(narrow, key=lambda pair: pair[0]):
         if _angle(direction, surface.normal) > 1e-3:
             return direction
@@ -422,7 +382,7 @@ def _pole(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> Array
 
 def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: str, rtol: float) -> float:
     if part["kind"] == "collimated":
-        w = _axis(part)
+        w = axis(part)
         mu_i = float(w @ surface.normal)
         if mu_i <= 0 or term["model"] == "specular":  # a mirror shows a beam as a delta function of the gradient
             return 0.0
@@ -434,17 +394,17 @@ def _pair(term: dict[str, Any], part: dict[str, Any], surface: Surface, method: 
     found = _arrange(term, part, surface)
     if term["model"] == "specular":
         direction = surface.mirror[None]
-        return term["rho"] * float(np.where(found.inside(direction), _radiance(part, direction), 0.0)[0])
+        return term["rho"] * float(np.where(found.inside(direction), radiance(part, direction), 0.0)[0])
     if method == "normal":
         rings = _Rings(surface.tangent, surface.normal, found, RULES["normal"])
-        return rings.integral(lambda t, u, w: _by_angles(term, surface, t, u) * np.cos(t) * _radiance(part, w), rtol)
+        return rings.integral(lambda t, u, w: _by_angles(term, surface, t, u) * np.cos(t) * radiance(part, w), rtol)
     pole = _pole(term, part, surface)
     side = min((surface.mirror, surface.normal), key=lambda d: abs(float(d @ pole)))  # azimuth 0, away from the pole
     if abs(float(side @ pole)) > 0.999:
         side = np.roll(pole, 1) + np.array([0.1, 0.0, 0.0])
     rings = _Rings(side, pole, found, RULES["other"])
     return rings.integral(
-        lambda t, u, w: _by_vectors(term, surface, w) * np.maximum(0.0, w @ surface.normal) * _radiance(part, w), rtol
+        lambda t, u, w: _by_vectors(term, surface, w) * np.maximum(0.0, w @ surface.normal) * radiance(part, w), rtol
     )
 
 

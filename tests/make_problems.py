@@ -54,6 +54,63 @@ BRDFS: dict[str, Terms] = {
     "varnish": [lambertian(0.3), ggx(0.05), phong(20.0, k_s=0.2), {"model": "specular", "rho": 0.04}],
 }
 
+_METAL = {"model": "microfacet", "k_s": 1.0, "alpha": 1.0, "distribution": "ggx", "multiple_scattering": True}
+MORE: dict[str, Terms] = {
+    "maria": [{"model": "minnaert", "albedo": 0.3, "k": 0.6}],
+    "velvet": [{"model": "minnaert", "albedo": 0.5, "k": 1.6}],
+    "dust": [{"model": "lommel_seeliger", "w": 0.3}],
+    "regolith": [{"model": "hapke", "w": 0.4, "b": 0.3, "c": 0.4, "B_0": 0.8, "h": 0.06, "theta_bar": math.radians(20.0)}],
+    "snow": [{"model": "hapke", "w": 0.97, "b": 0.4, "c": -0.6, "B_0": 0.0, "h": 0.05, "theta_bar": 0.0, "H": "2002"}],
+    "paint": [{"model": "kubelka_munk", "K_over_S": 0.1, "k_1": 0.04, "k_2": 0.6}],
+    "plaster": [{"model": "oren_nayar", "albedo": 0.7, "sigma": 0.5, "variant": "full"}],
+    "ceramic": [{"model": "eon", "albedo": 0.9, "roughness": 0.8}],
+    "plastic": [{"model": "plastic", "albedo": 0.6, "n": 1.5}],
+    "blinn 80": [{"model": "blinn_phong", "k_s": 0.5, "n": 80.0}],
+    "beads": [{"model": "lafortune", "k_s": 0.4, "C_xy": 0.9, "C_z": 1.0, "n": 30.0}],
+    "off specular": [{"model": "lafortune", "k_s": 0.6, "C_xy": -1.0, "C_z": 0.8, "n": 15.0}],
+    "ward 0.15": [{"model": "ward", "k_s": 0.6, "alpha": 0.15}],
+    "duer 0.2": [{"model": "ward", "k_s": 0.6, "alpha": 0.2, "variant": "duer"}],
+    "bounded ward": [{"model": "ward", "k_s": 0.9, "alpha": 0.1, "variant": "gmd"}],
+    "lacquer": [{"model": "ashikhmin_shirley", "R_d": 0.4, "R_s": 0.05, "n": 200.0}],
+    "scratched": [{"model": "abg", "A": 1e-3, "B": 1e-3, "g": 1.5}],
+    "polished": [{"model": "harvey_shack", "b_0": 50.0, "l": 0.01, "s": -1.8}],
+    "superpolished": [{"model": "k_correlation", "A": 1e-3, "B": 20.0, "C": 2.0, "wavelength_um": 0.6328}],
+    "beckmann 0.2": [{"model": "beckmann", "k_s": 1.0, "alpha": 0.2, "f_0": 0.05}],
+    "berry": [{"model": "microfacet", "k_s": 1.0, "alpha": 0.15, "gamma": 1.0, "f_0": 0.6, "distribution": "gtr"}],
+    "student": [
+        {
+            "model": "microfacet", "k_s": 1.0, "alpha": 0.2, "gamma": 3.0, "n": 1.5, "distribution": "std",
+            "fresnel": "dielectric",
+        }
+    ],
+    "gold": [
+        {
+            "model": "microfacet", "k_s": 1.0, "alpha": 0.25, "n": 0.2, "k": 3.0, "distribution": "ggx",
+            "fresnel": "conductor", "shadowing": "smith_separable",
+        }
+    ],
+    "grooves": [
+        {
+            "model": "microfacet", "k_s": 1.0, "alpha": 0.3, "n": 2.8, "k": 3.2, "distribution": "beckmann",
+            "fresnel": "conductor", "shadowing": "v_groove",
+        }
+    ],
+    "wide grooves": [
+        {
+            "model": "microfacet", "k_s": 0.9, "alpha": 0.4, "gamma": 1.5, "distribution": "gtr", "fresnel": "none",
+            "shadowing": "v_groove",
+        }
+    ],
+    "furnace": [{**_METAL, "fresnel": "none"}],
+    "rough gold": [{**_METAL, "fresnel": "schlick", "f_0": 0.7}],
+    "coated paint": [
+        {"model": "plastic", "albedo": 0.6, "n": 1.5},
+        {"model": "beckmann", "k_s": 1.0, "alpha": 0.1, "f_0": 0.04},
+        {"model": "abg", "A": 1e-4, "B": 1e-3, "g": 2.0},
+    ],
+}  # fmt: skip
+BRDFS |= MORE
+
 ASIDE = (0.7, 1.0)  # theta, phi [rad] of the sources that have a direction
 LOW = (1.25, 2.5)
 
@@ -83,6 +140,8 @@ MAP = {
         [round(0.2 + math.sin(1.3 * i + 0.7 * j) ** 2 + (i == 2) * (j == 5) * 4.0, 6) for j in range(16)] for i in range(8)
     ],
 }
+SMOOTH = {**MAP, "interpolation": "smooth", "radiance": [[round(1.0 + v, 6) for v in row] for row in MAP["radiance"]]}
+HARMONICS = {"kind": "spherical_harmonics", "coefficients": [3.0, 0.4, 0.9, -0.5, 0.3, -0.2, 0.35, 0.15, -0.25]}
 SOURCES: dict[str, Terms] = {
     "beam": [beam(2.0, ASIDE)],
     "sphere": [{"kind": "uniform", "radiance": 1.0}],
@@ -100,6 +159,8 @@ SOURCES: dict[str, Terms] = {
     "lobe 10000": [lobe(1e4)],
     "studio": [{"kind": "uniform", "radiance": 0.2}, STUDIO],
     "map": [MAP],
+    "smooth map": [SMOOTH],
+    "harmonics": [HARMONICS],
     "day": [{"kind": "overcast", "zenith_radiance": 0.5}, disk(0.25), beam(1.0, LOW)],
 }
 
@@ -109,6 +170,9 @@ def gradient(theta_n: float, phi_n: float) -> tuple[float, float]:
     return -t * math.cos(phi_n), -t * math.sin(phi_n)
 
 
+MORE_SOURCES = (
+    "sphere", "tilted sky", "tilted overcast", "sun", "disk 5", "lobe 100", "studio", "map", "smooth map", "harmonics",
+)  # fmt: skip
 TILTS = (0.0, 30.0, 60.0, 85.0, 89.9)
 
 
@@ -136,8 +200,8 @@ def feasible(brdf: str, degrees: float) -> bool:
 
 def problems() -> Iterator[dict[str, Any]]:
     """All scenes, without values."""
-    for b, brdf in enumerate(BRDFS):
-        for s, source in enumerate(SOURCES):
+    for b, brdf in enumerate(name for name in BRDFS if name not in MORE):
+        for s, source in enumerate(name for name in SOURCES if name not in ("smooth map", "harmonics")):
             if source == "beam" and brdf in ("mirror", "varnish"):
                 continue  # a delta function of the gradient: no value
             for k in (0, 2) if source in ("sky", "map", "studio") else (0,):
@@ -153,10 +217,28 @@ def problems() -> Iterator[dict[str, Any]]:
                     yield scene(brdf, source, at, [tag])
 
 
+    yield from more_problems()
+
+
+def more_problems() -> Iterator[dict[str, Any]]:
+    """Every other model under every kind of light, the hard gradients and the tilts in turn."""
+    for b, brdf in enumerate(MORE):
+        for s, source in enumerate(MORE_SOURCES):
+            hard = special(source)
+            phi_n = ASIDE[1] + 0.3 if hard else (1.7 * b + 0.9 * s) % 6.28  # a tilted surface sees the source
+            tilts = [(f"theta_n {t:g}", gradient(math.radians(t), phi_n)) for t in TILTS]
+            tilts[0] = ("theta_n 0", (0.0, 0.0))
+            hard = hard + tilts[-2:] if hard else tilts
+            for k in (0, 2) if source in ("sphere", "disk 5") else (0,):
+                tag, at = hard[(b + s + k) % len(hard)]
+                yield scene(brdf, source, at, [tag] + (["grazing"] if tag in ("theta_n 85", "theta_n 89.9") else []))
+
+
 def scene(brdf: str, source: str, at: tuple[float, float], tags: list[str]) -> dict[str, Any]:
     widths = [t["alpha"] if "alpha" in t else t.get("n", 1.0) ** -0.5 for t in BRDFS[brdf]]
     more = ["narrow lobe"] if min(widths) < 0.04 else []
-    more += ["kinks"] if brdf in ("clay", "rough clay") or source == "map" else []
+    kinked = ("clay", "rough clay", "regolith", "plaster", "ceramic", "lacquer", "grooves", "wide grooves")
+    more += ["kinks"] if brdf in kinked or source == "map" else []
     more += ["small source"] if source in ("sun", "lobe 10000", "day") else []
     more += ["two horizons"] if "sky" in source or "overcast" in source else []
     return {"brdf": brdf, "source": source, "p": at[0], "q": at[1], "tags": tags + more}
@@ -184,7 +266,7 @@ def main() -> None:
             raise SystemExit(f"{problem}: {value!r} and {second!r} differ by {off:.1e}")
         done.append({**problem, "value": value, "second": second, "difference": off})
         tags = ", ".join(problem["tags"])
-        print(f"{len(done):4d} {problem['brdf']:12s} {problem['source']:18s} {value:.16g} {off:.1e} {tags}", flush=True)
+        print(f"{len(done):4d} {problem['brdf']:13s} {problem['source']:18s} {value:.16g} {off:.1e} {tags}", flush=True)
         if len(done) % 20 == 0:
             write(done + [p for k, p in known.items() if k not in {key(d) for d in done}])
     write(done)
