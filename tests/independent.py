@@ -187,10 +187,14 @@ def _by_vectors(term: dict[str, Any], surface: Surface, w: Array) -> Array:
 
 @dataclass
 class _Arrangement:
-    """Circles (centre, angular radius, whether only its inside counts) and narrow features (direction, width)."""
+    """Circles (centre, angular radius, whether only its inside counts) and narrow features (direction, width).
+
+    `curve`, a polynomial of degree 2 in the components of w, vanishes where a derivative jumps elsewhere.
+    """
 
     circles: list[tuple[Array, float, bool]] = field(default_factory=list)
     features: list[tuple[Array, float]] = field(default_factory=list)
+    curve: Callable[[Array], Array] | None = None
 
     def inside(self, w: Array) -> NDArray[np.bool_]:
         kept = np.ones(len(w), dtype=bool)
@@ -253,8 +257,50 @@ class _Rings:
         for direction, width in self.arrangement.features:
             t = self._polar(direction)[0]
             at += [t + step for step in _steps(width)]
+        if self.arrangement.curve is not None:
+            at += self._touched(self.arrangement.curve) + self._met(self.arrangement.curve)
         at = sorted(t for t in at if 0.0 <= t <= math.pi)
         return np.array([t for k, t in enumerate(at) if k == 0 or t - at[k - 1] > 1e-14])
+
+    def _crossings(self, curve: Callable[[Array], Array], t: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Where the rings t (n,) meet the curve (n, 4), 0 where they do not; and a number that tells rings apart.
+
+        On a ring the curve is a trigonometric polynomial of degree 2: five samples give it, and it is one of degree 4 in
+        exp(i chi).
+        """
+        chi = 2 * math.pi * np.arange(5) / 5
+        samples = curve(self.directions(np.repeat(t, 5), np.tile(chi, len(t)))).reshape(-1, 5)
+        waves = np.fft.fft(samples, axis=1) / 5  # of exp(i m chi), m = 0, 1, 2, -2, -1
+        polynomial = waves[:, [2, 1, 0, 4, 3]]  # from the highest power down
+        cuts, kind = np.zeros((len(t), 4)), np.sign(samples[:, 0]).astype(int) * 5
+        size = np.abs(polynomial).max(axis=1)
+        for k in np.flatnonzero(np.abs(polynomial).sum(axis=1) > 1.0000001 * np.abs(polynomial[:, 2])):
+            roots = np.roots(np.where(np.abs(polynomial[k]) > 1e-15 * size[k], polynomial[k], 0.0))
+            found = np.mod(np.angle(roots[np.abs(np.abs(roots) - 1) < 1e-6]), 2 * math.pi)
+            cuts[k, : len(found)] = found
+            kind[k] += len(found)
+        return cuts, kind
+
+    def _touched(self, curve: Callable[[Array], Array]) -> list[float]:
+        """Rings where the number of crossings changes, by bisection."""
+        t = np.linspace(0.0, math.pi, 1001)
+        kind = self._crossings(curve, t)[1]
+        change = np.flatnonzero(np.diff(kind))
+        low, high, left = t[change], t[change + 1], kind[change]
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            same = self._crossings(curve, middle)[1] == left
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+        return list(0.5 * (low + high))
+
+    def _met(self, curve: Callable[[Array], Array]) -> list[float]:
+        """Rings on which the curve meets a circle."""
+        found = []
+        for centre, radius, _ in self.arrangement.circles:
+            around = _Rings(np.roll(centre, 1) + np.array([0.3, 0.0, 0.1]), centre, self.arrangement, self.rule)
+            cuts = around._crossings(curve, np.array([radius]))[0][0]
+            found += [_angle(self.e3, w) for w in around.directions(np.full(4, radius), cuts)]
+        return found
 
     def panels(self, t: Array) -> tuple[Array, Array, NDArray[np.intp]]:
         """Smooth and lit pieces of the rings t (n,): lower and upper azimuth and the ring's number."""
@@ -276,6 +322,8 @@ class _Rings:
             while np.any(scale * step < 3.0):
                 cuts += [np.where(scale * step < 3.0, np.mod(chi + s * scale * step, 2 * math.pi), 0.0) for s in (-1, 1)]
                 step = step * 5.0
+        if self.arrangement.curve is not None:
+            cuts += list(self._crossings(self.arrangement.curve, t)[0].T)
         edges = np.sort(np.stack(cuts, axis=1), axis=1)
         lower, upper = edges[:, :-1], edges[:, 1:]
         ring = np.broadcast_to(np.arange(len(t))[:, None], lower.shape)
@@ -352,6 +400,7 @@ def _arrange(term: dict[str, Any], part: dict[str, Any], surface: Surface) -> _A
     if (others := _others(term)) is not None:
         found.features += others.features(term, surface)
         found.circles += others.circles(term, surface)
+        found.curve = others.curve(term, surface)
     elif term["model"] == "ggx":
         found.features.append((surface.mirror, term["alpha"]))
     elif term["model"] == "phong":

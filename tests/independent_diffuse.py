@@ -176,3 +176,8 @@ def circles(term: Term, surface: Any) -> list[Circle]:
     if term["model"] in ("oren_nayar", "eon"):
         return [*equal_elevation(surface), (surface.tangent, HALF_PI, False)]
     return []
+
+
+def curve(term: Term, surface: Any) -> Any:
+    """What vanishes where a derivative jumps elsewhere than at `circles`: nowhere."""
+    return None

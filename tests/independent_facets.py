@@ -129,3 +129,15 @@ def circles(term: Term, surface: Any) -> list[Circle]:
     if _choice(term, "shadowing") != "v_groove":
         return []
     return [*equal_elevation(surface), (surface.mirror, math.pi - 2 * surface.theta_r, False)]
+
+
+def curve(term: Term, surface: Any) -> Any:
+    """Of v-grooves, what vanishes where the lower one of the directions begins to be hidden: l^2 - 4 (mu_i + mu_r) mu_i."""
+    if _choice(term, "shadowing") != "v_groove":
+        return None
+
+    def hidden(w: Array) -> Array:
+        mu_i = w @ surface.normal
+        return 2 + 2 * w[:, 2] - 4 * (mu_i + surface.cos_r) * mu_i
+
+    return hidden

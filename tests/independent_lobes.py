@@ -85,6 +85,11 @@ def circles(term: Term, surface: Any) -> list[Circle]:
     return equal_elevation(surface) if term["model"] == "ashikhmin_shirley" else []
 
 
+def curve(term: Term, surface: Any) -> Any:
+    """What vanishes where a derivative jumps elsewhere than at `circles`: nowhere."""
+    return None
+
+
 def _axis(term: Term, surface: Any) -> Array:
     axis = term["C_z"] * surface.cos_r * surface.normal - term["C_xy"] * surface.sin_r * surface.tangent
     return np.asarray(axis / np.linalg.norm(axis))
