@@ -2,9 +2,10 @@ r"""Phong's lobe, normalised to be a BRDF, and its widening by Lafortune.
 
 .. math:: f_r = k_s\,\frac{n+2}{2\pi}\,\max(0, m\cdot\omega_i)^n
 
-with m the mirror image of :math:`\omega_r`. Phong's own law is one of radiance; here, as in [2]_, the cosine of the
-incidence stays in the integral, the lobe is reciprocal, and k_s is the directional albedo at normal incidence (elsewhere it
-is less: the horizon cuts the lobe). Lafortune's lobe [3]_ weighs the tangential and the normal part of the product apart,
+with m the mirror image of :math:`\omega_r`. Phong's own law is one of radiance; here, after Lafortune and Willems [2]_,
+the cosine of the incidence stays in the integral, the lobe is reciprocal, and k_s is the directional albedo at normal
+incidence (elsewhere it is less: the horizon cuts the lobe). Lafortune's lobe [3]_ weighs the tangential and the normal part
+of the product apart,
 
 .. math:: f_r = k_s\,\frac{n+2}{2\pi}\,\max\Bigl(0,
           \frac{C_{xy}\,(x_i x_r + y_i y_r) + C_z\,\mu_i\mu_r}{\max(|C_{xy}|, C_z)}\Bigr)^n .

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from gonio.cli.formulas import plain
 from gonio.cli.output import Output, json_option, speaking
 from gonio.config.scene import written_name
 from gonio.errors import ParameterError
@@ -34,7 +35,9 @@ def models(name: str | None, plot: Path | None, as_json: bool) -> None:
         if name is None:
             _list(output, _loaded(output))
             return
-        model = brdf.parse(name)[0]
+        model, *others = brdf.parse(name)
+        if others:
+            raise ParameterError(f"{name} is a sum; explain one model at a time: gonio models {model.expression}")
         _explain(output, brdf.families.find(model.name), model)
         shown = _typical(model)
         if shown is None:
@@ -100,14 +103,12 @@ def _explain(output: Output, family: Family, model: Model) -> None:
 
 
 def _page(model: Model) -> str:
-    """Docstring of the file that defines the model, without its references and its directives."""
+    """Docstring of the file that defines the model, without its references, its formulas in plain characters."""
     function: Callable[..., Any] | None = getattr(model.function, "py_func", model.array_function)
     module = sys.modules.get(getattr(function, "__module__", "") or "")
     text = inspect.cleandoc(module.__doc__ or "") if module is not None else ""
     text = text.partition("\nReferences\n")[0]
-    for old, new in ((".. math::\n", "\n"), (".. math::", "   "), (":math:", "")):
-        text = text.replace(old, new)
-    text = re.sub(r"\n{3,}", "\n\n", re.sub(r" ?\[\d+\]_", "", text))
+    text = re.sub(r"\n{3,}", "\n\n", plain(re.sub(r" ?\[\d+\]_", "", text)))
     return "\n".join(f"    {line}".rstrip() for line in text.strip().splitlines())
 
 
@@ -138,7 +139,7 @@ def _held(parameter: Parameter) -> str:
 
 
 def _typical(model: Model) -> Any:
-    """The BRDF at its priors' centres and fixed values; None for a delta function."""
+    """The BRDF at its priors' medians, lower quartiles of uniform ones, and fixed values; None for a delta function."""
     from gonio.brdf import make
 
     if model.delta:
@@ -152,7 +153,7 @@ def _centre(parameter: Parameter) -> float:
     if parameter.default is not None:
         return parameter.default
     kind, a, b = parameter.prior
-    return min(max(math.exp(a) if kind == "log_normal" else 0.5 * (a + b), parameter.lower), parameter.upper)
+    return min(max(math.exp(a) if kind == "log_normal" else a + 0.25 * (b - a), parameter.lower), parameter.upper)
 
 
 def _draw(brdf: Any, plot: Path) -> None:

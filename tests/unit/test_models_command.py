@@ -45,7 +45,9 @@ def test_one_model_in_full(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
 def test_every_model_can_be_explained(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", name]) == 0
     told = capsys.readouterr()
-    assert "Source: " in told.out and told.err == ""
+    assert "Source: " in told.out and told.err == "" and "\\" not in told.out and told.out.isascii()
+    page = told.out.partition("\n\n")[2]
+    assert all(page.count(a) == page.count(b) for a, b in ("()", "{}"))
     assert ("Radius: log f_r" in told.out) == (not families.find(name).model().delta)
 
 
@@ -56,6 +58,7 @@ def test_every_model_can_be_explained(name: str, capsys: pytest.CaptureFixture[s
         (["--plot", "x.png"], "name it"),
         (["ggx", "--plot", "x.pdf"], "no .png file"),
         (["ggx[variant=x]"], "variant"),
+        (["ggx+phong"], "one model at a time: gonio models ggx"),
     ],
 )
 def test_what_cannot_be_drawn_is_told(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
