@@ -137,7 +137,7 @@ def _term_kernel(function: Callable[..., float]) -> Any:
                 for j in range(to.size):
                     to[j] += function(xi[j], yi[j], zi[j], xr[j], yr[j], zr[j], p)
 
-    return jit.kernel(accumulate_walkers)
+    return jit.kernel(accumulate_walkers, apart=True)
 
 
 def shared_parameters(samples: BRDFSamples, use: bool) -> list[Declared]:

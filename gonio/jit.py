@@ -6,8 +6,8 @@ constants, so an edit anywhere recompiles and an undone edit hits again. Each ke
 symbols are named by content, so kernels of different processes cannot be taken for each other. A damaged or read-only
 cache means compiling again.
 
-This leans on private parts of numba (`FunctionCache`); tests/unit/test_jit.py shows that a second process hits and that
-edits miss.
+This leans on private parts of numba (`FunctionCache`, the flag of arrays that do not overlap); tests/unit/test_jit.py shows
+that a second process hits, that edits miss and that the flag arrives.
 """
 
 from __future__ import annotations
@@ -55,13 +55,16 @@ def part(function: Callable[..., Any], **options: Any) -> Any:
     return numba.njit(error_model="numpy", fastmath=False, **options)(_named(function, key))
 
 
-def kernel(function: Callable[..., Any], **options: Any) -> Any:
+def kernel(function: Callable[..., Any], *, apart: bool = False, **options: Any) -> Any:
     """Compile a kernel and keep its machine code on disk.
 
     Parameters
     ----------
     function : callable
         May close over functions compiled by `model` and `part`, numbers, strings, tuples and arrays.
+    apart : bool, optional
+        The promise that no array which is written shares memory with another argument. Loops that look numbers up at
+        computed places, as in tables, vectorise by it alone; a broken promise gives wrong numbers.
     **options
         Passed to ``numba.njit``.
 
@@ -72,12 +75,19 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """
     options = {"error_model": "numpy", "fastmath": FAST, "nogil": True} | options
     shown = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in options.items())
-    text = repr([_FORMAT, numba.__version__, shown, _fingerprint(function, set())])
+    text = repr([_FORMAT, numba.__version__, shown, apart, _fingerprint(function, set())])
     key = hashlib.sha256(text.encode()).hexdigest()
     function = _named(function, key)
     compiled = numba.njit(**options)(function)
+    if apart:
+        compiled._compiler._customize_flags = _apart
     compiled._cache = _Cache(function, key, cache_folder())
     return compiled
+
+
+def _apart(flags: Any) -> Any:
+    flags.noalias = True
+    return flags
 
 
 def cache_folder() -> Path:

@@ -20,7 +20,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import ArrayLike, NDArray
 
 from gonio import jit
@@ -28,7 +27,6 @@ from gonio.errors import GeometryError, ParameterError
 from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
-_FEW = 16  # parameters of a term that a sum keeps in registers
 _SLANTED = np.array([0.6, 0.0, 0.8])
 
 
@@ -86,7 +84,7 @@ class Model:
         In the order of the parameter array, whose first numbers they are.
     function : callable
         ``f(xi, yi, zi, xr, yr, zr, p) -> f_r`` [1/sr], compiled by `gonio.jit.model`; None for a delta function and for
-        a function that is not compiled. p is an array or, in sums, up to 16 numbers as a tuple: take them one by one.
+        a function that is not compiled.
     lobe_width : callable, optional
         Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
         angle; the integrator lays its nodes by it. None: no lobe.
@@ -290,7 +288,7 @@ class BRDF:
         Returns
         -------
         ndarray, shape (...)
-            [1/sr].
+            [1/sr]; 0 where a direction is at or below the horizon, NaN where one is NaN.
         """
         wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
         flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
@@ -351,14 +349,21 @@ def accumulate(model: Model) -> Any:
     return _accumulate(model.function)
 
 
+@jit.model
+def _known(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, value: float) -> float:
+    """The value, NaN if a direction is; models that need few of the six numbers are faster where all are loaded in a row."""
+    return value if (xi == xi) & (yi == yi) & (zi == zi) & (xr == xr) & (yr == yr) & (zr == zr) else math.nan
+
+
 @functools.cache
 def _accumulate(function: Callable[..., float]) -> Any:
     def accumulate_terms(omega_i, omega_r, p, weight, out):  # type: ignore[no-untyped-def]
         i, r = omega_i.ravel(), omega_r.ravel()  # with one index the loop vectorises
         for k in range(out.size):
-            out[k] += weight * function(i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2], p)
+            xi, yi, zi, xr, yr, zr = i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2]
+            out[k] += weight * _known(xi, yi, zi, xr, yr, zr, function(xi, yi, zi, xr, yr, zr, p))
 
-    return jit.kernel(accumulate_terms)
+    return jit.kernel(accumulate_terms, apart=True)
 
 
 def sum_kernel(terms: Sequence[Term]) -> tuple[Any, Array] | None:
@@ -376,57 +381,39 @@ def sum_kernel(terms: Sequence[Term]) -> tuple[Any, Array] | None:
 @functools.cache
 def _sum_kernel(functions: tuple[Any, ...], sizes: tuple[int, ...]) -> Any:
     """Kernel of a sum of terms; its parameter array holds, term after term, weight and parameters."""
-    load: Any = None
     total: Any = None
     start = 0
     for function, size in zip(functions, sizes, strict=True):
-        load, total = _joined(load, total, function, start, size)
+        total = _joined(total, function, start, size)
         start += 1 + size
 
     def fill_with_sum(omega_i, omega_r, p, out):  # type: ignore[no-untyped-def]
         i, r = omega_i.ravel(), omega_r.ravel()
-        numbers = load(p)  # read once: in the loop nobody could know that `out` doesn't overlap them
         for k in range(out.size):
-            out[k] = total(i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2], numbers)
+            xi, yi, zi, xr, yr, zr = i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2]
+            out[k] = _known(xi, yi, zi, xr, yr, zr, total(xi, yi, zi, xr, yr, zr, p))
 
-    return jit.kernel(fill_with_sum)
+    return jit.kernel(fill_with_sum, apart=True)
 
 
-def _joined(load: Any, before: Any, function: Callable[..., float], start: int, size: int) -> tuple[Any, Any]:
-    """What takes the numbers of one more term from the array, and the sum that takes those."""
+def _joined(before: Any, function: Callable[..., float], start: int, size: int) -> Any:
+    """The sum with one more term, whose weight is p[start]."""
     first, stop = start + 1, start + 1 + size
-    if 0 < size <= _FEW:
 
-        def own(p):  # type: ignore[no-untyped-def]
-            return p[start], to_fixed_tuple(p[first:stop], size)
+    def only(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+        return p[start] * function(xi, yi, zi, xr, yr, zr, p[first:stop])
 
-    else:
+    def both(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
+        return before(xi, yi, zi, xr, yr, zr, p) + p[start] * function(xi, yi, zi, xr, yr, zr, p[first:stop])
 
-        def own(p):  # type: ignore[no-untyped-def]
-            return p[start], p[first:stop]
-
-    numbers_of: Any = jit.model(own)
-    if before is None:
-
-        def only(xi, yi, zi, xr, yr, zr, numbers):  # type: ignore[no-untyped-def]
-            return numbers[0] * function(xi, yi, zi, xr, yr, zr, numbers[1])
-
-        return numbers_of, jit.model(only)
-
-    def all_numbers(p):  # type: ignore[no-untyped-def]
-        return load(p), numbers_of(p)
-
-    def both(xi, yi, zi, xr, yr, zr, numbers):  # type: ignore[no-untyped-def]
-        rest, mine = numbers
-        return before(xi, yi, zi, xr, yr, zr, rest) + mine[0] * function(xi, yi, zi, xr, yr, zr, mine[1])
-
-    return jit.model(all_numbers), jit.model(both)
+    return jit.model(only if before is None else both)
 
 
 def _accumulate_array(
     function: Callable[[Array, Array, Array], Array], omega_i: Array, omega_r: Array, p: Array, weight: float, out: Array
 ) -> None:
-    out += weight * function(omega_i, omega_r, p)
+    unknown = np.isnan(omega_i).any(axis=1) | np.isnan(omega_r).any(axis=1)
+    out += weight * np.where(unknown, np.nan, function(omega_i, omega_r, p))
 
 
 def term_names(models: Iterable[Model]) -> tuple[str, ...]:

@@ -107,7 +107,7 @@ def _filling(function: Callable[..., float]) -> Any:
                 a, b = 3 * k, 3 * k + 1
                 to[k] = weight * slope(i[a], i[b], i[a + 2], r[a], r[b], r[a + 2], p, d)[1]
 
-    return jit.kernel(fill_slopes)
+    return jit.kernel(fill_slopes, apart=True)
 
 
 def seeds(model: Model, p: Array) -> Array:

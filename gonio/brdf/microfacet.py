@@ -117,8 +117,12 @@ def _kinks(p: Array, omega_r: Array) -> Array:
 
     The border for omega_i as the lower direction is no plane; the integrator finds that one by itself.
     """
-    x, y, mu = omega_r
-    return np.array([[-x, -y, mu, 1.0 - 2.0 * mu * mu], [0.0, 0.0, 1.0, mu]])
+    mu = omega_r[..., 2]
+    planes = np.zeros((*mu.shape, 2, 4))
+    planes[..., 0, :3] = omega_r * (-1.0, -1.0, 1.0)
+    planes[..., 0, 3] = 1.0 - 2.0 * mu * mu
+    planes[..., 1, 2], planes[..., 1, 3] = 1.0, mu
+    return planes
 
 
 @functools.cache

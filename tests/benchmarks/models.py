@@ -9,23 +9,23 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import itertools
 import math
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gonio.brdf import BRDF, Family, Model, Term, families
-from gonio.brdf.base import Array, accumulate
+from gonio.brdf import BRDF, Model, Term
+from gonio.brdf.base import accumulate
 from tests.benchmarks import page
 from tests.benchmarks.kernels import SIZE, _directions, build
+from tests.registered import compiled, typical
 
 PROMISED = 1.5  # of gonio's time to C's
 AGREEMENT = 1e-10
@@ -58,29 +58,6 @@ class Speed:
         return math.nan if self.c is None else self.gonio / self.c
 
 
-def variants(family: Family) -> Iterator[Model]:
-    """The family with its default choices, then with each other choice by itself."""
-    yield family.model()
-    for key, allowed in family.choices.items():
-        for choice in allowed[1:]:
-            yield family.model(**{key: choice})
-
-
-def every() -> list[Model]:
-    """All compiled models of all families, each choice once."""
-    found = itertools.chain.from_iterable(variants(family) for family in families.FAMILIES.values())
-    return [model for model in found if model.function is not None]
-
-
-def typical(model: Model) -> Array:
-    """Parameters inside the ranges, derived numbers behind them: at the median of each prior."""
-    values = []
-    for p in model.parameters:
-        kind, a, b = p.prior
-        values.append(min(max(math.exp(a) if kind == "log_normal" else a + 0.37 * (b - a), p.lower), p.upper))
-    return model.complete(np.array(values))
-
-
 def c_name(model: Model) -> str:
     """As models.c calls it: ``oren_nayar_full``; a flag by its own name."""
     return "_".join([model.name, *(key if value == "true" else value for key, value in model.choices.items())])
@@ -94,7 +71,7 @@ def measure(seconds: float = 0.15) -> list[Speed]:
     n = ctypes.c_long(SIZE)
     with tempfile.TemporaryDirectory() as folder:
         library = build(Path(folder), "models.c")
-        for model in every():
+        for model in compiled():
             p, out, filled = typical(model), np.zeros(SIZE), np.zeros(SIZE)
             kernel, brdf, differs = accumulate(model), BRDF([Term(model, p)]), math.nan
             runs: dict[str, Callable[[], object]] = {"gonio": functools.partial(kernel, w_i, w_r, p, 1.0, out)}
@@ -169,10 +146,8 @@ def compile_all() -> int:
         gonio.source.make("disk", theta=0.6, phi=0.2, half_angle=0.1, radiance=1.0),
     ]
     p = np.linspace(-2.0, 2.0, 5)
-    for model in every():
-        brdf = BRDF([Term(model, typical(model))]) if model.parameters else None
-        if brdf is None:
-            continue
+    for model in compiled():
+        brdf = BRDF([Term(model, typical(model))])
         brdf.jacobian(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.6, 0.8]))
         for source in sources:
             gonio.reflectance_map(brdf, source, p[:, None], p, rtol=1e-2)

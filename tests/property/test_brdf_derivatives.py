@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import gonio
 from gonio import jit
-from gonio.brdf import BRDF, Family, Model, Parameter, Term, derivatives, families
+from gonio.brdf import BRDF, Model, Parameter, Term, derivatives, families
 from gonio.brdf.elementary import exp, log, log1p, power
 from gonio.brdf.tangent import tangent
 from gonio.errors import ParameterError
@@ -32,6 +32,7 @@ from gonio.geometry import unit_vector
 from tests.brdf_formulas import MICROFACETS, PLAIN, SHORTS, Case
 from tests.brdf_truth import Geometry
 from tests.gates import record
+from tests.registered import compiled, middle
 
 Array = NDArray[np.float64]
 make = gonio.brdf.make
@@ -163,26 +164,7 @@ def in_mpmath(function: Any) -> Callable[..., Any]:
     return types.FunctionType(inner.__code__, space, inner.__name__, inner.__defaults__, cells)
 
 
-def registered() -> Iterator[Model]:
-    """Every model with its default choices, and with each other choice once."""
-    for family in [*families.FAMILIES.values()]:
-        yield from _variants(family)
-
-
-def _variants(family: Family) -> Iterator[Model]:
-    yield family.model()
-    for key, allowed in family.choices.items():
-        for choice in allowed[1:]:
-            yield family.model(**{key: choice})
-
-
-MODELS = {model.expression: model for model in registered() if model.function is not None and model.parameters}
-
-
-def middle(parameter: Parameter) -> float:
-    kind, a, b = parameter.prior
-    value = a + 0.37 * (b - a) if kind == "uniform" else math.exp(a)
-    return min(max(value, parameter.lower), parameter.upper)
+MODELS = {model.expression: model for model in compiled()}
 
 
 def parameter_sets(model: Model) -> Iterator[tuple[list[float], list[int]]]:

@@ -12,6 +12,7 @@ import gonio
 from gonio import jit
 from gonio.errors import ParameterError
 from gonio.geometry import unit_vector
+from tests.registered import compiled, typical
 
 make = gonio.brdf.make
 _THETAS = [0.0, 1e-8, 0.3, 1.0, math.radians(89.99)]
@@ -91,6 +92,18 @@ def test_reciprocal_and_zero_below_the_horizon(brdf: gonio.BRDF) -> None:
     assert np.all(forward[(wi[:, 2] <= 0) | (wr[:, 2] <= 0)] == 0)
 
 
+def test_a_direction_that_is_nan_gives_nan() -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    lambert, ggx = make("lambertian", albedo=0.5), make("ggx", k_s=1.0, alpha=0.1, f_0=1.0)
+    python = gonio.brdf.from_function(lambda omega_i, omega_r: np.full(len(omega_i), 0.1))
+    for brdf in (lambert, lambert + ggx, python):
+        for at in range(3):
+            bad = up.copy()
+            bad[at] = np.nan
+            assert np.all(np.isnan([brdf.evaluate(bad, up), brdf.evaluate(up, bad)]))
+        assert brdf.evaluate(up, up) > 0.0 == brdf.evaluate(-up, up)
+
+
 def test_kinks_are_declared_where_the_slope_jumps() -> None:
     """On each side of a declared plane the derivative across it differs; away from the planes it does not."""
     wr = unit_vector(0.8, 0.3)
@@ -115,6 +128,21 @@ def test_kinks_are_declared_where_the_slope_jumps() -> None:
             assert abs(slopes[1] - slopes[0]) > 0.01
     assert len(make("phong", k_s=1.0, n=100.0).terms[0].kinks(wr)) == 0
     assert len(make("ggx", k_s=1.0, alpha=0.1, f_0=1.0).terms[0].kinks(wr)) == 0
+
+
+def test_kinks_of_many_directions_are_those_of_each() -> None:
+    wr = unit_vector(np.array([[0.0, 0.8, 1.5], [0.4, 1.0, 1.2]]), 0.3)
+    kinked = 0
+    for model in compiled():
+        if model.kinks is None:
+            continue
+        kinked += 1
+        planes = model.kinks(typical(model), wr)
+        assert planes.shape == (2, 3, planes.shape[2], 4)
+        for at in np.ndindex(2, 3):
+            assert np.array_equal(planes[at], model.kinks(typical(model), wr[at])), model.expression
+        assert np.linalg.norm(planes[..., :3], axis=-1) == pytest.approx(np.ones(planes.shape[:-1]), rel=1e-15)
+    assert kinked >= 5
 
 
 # --- functions ------------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gonio import jit
@@ -100,3 +101,21 @@ def test_closures_of_one_factory_from_different_processes_keep_their_own_code(tm
             [sys.executable, "-c", _FACTORY, *powers], env=environment, capture_output=True, text=True, check=False
         )
         assert (done.returncode, done.stdout.strip()) == (0, compiled), done.stderr[-500:]
+
+
+def test_arrays_that_are_kept_apart_are_known_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+    def double(x, out):  # type: ignore[no-untyped-def]
+        for k in range(out.size):
+            out[k] = 2.0 * x[k]
+
+    marked = {}
+    for apart in (False, True):
+        kernel, out = jit.kernel(double, apart=apart), np.zeros(1)
+        kernel(np.ones(1), out)
+        assert out[0] == 2.0
+        lines = kernel.inspect_llvm(kernel.signatures[0]).splitlines()
+        marked[apart] = next(line for line in lines if line.startswith("define") and "double" in line).count("noalias")
+    # two pointers to data, two to their owners, two to what counts the owners
+    assert marked[True] == marked[False] + 6
