@@ -139,7 +139,9 @@ class ScpiLamp:
         self._level = found
 
     def describe(self) -> dict[str, object]:
-        """Identity and state for the run's metadata (JSON-compatible)."""
+        """Identity and state for the run's metadata (JSON-compatible); a lamp that was not switched yet is asked."""
+        if self._on is None:
+            self._on = self._query("OUTP?").upper() in ("1", "ON")
         return {
             "name": self._name, "kind": "scpi", "port": self._url, "identity": self._identity,
             "output": self._on, "level": self._level,

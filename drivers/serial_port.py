@@ -79,6 +79,19 @@ def lock_path(url: str) -> Path:
     return Path(tempfile.gettempdir()) / "gonio-ports" / f"{name}.lock"
 
 
+def holder(url: str) -> int | None:
+    """Process on this machine that holds a port, None if none does or it cannot be told."""
+    if "://" in url or not lock_path(url).exists():
+        return None
+    try:
+        FileLock(lock_path(url)).acquire().release()
+    except HeldError as held:
+        return held.pid
+    except OSError:
+        pass
+    return None
+
+
 def _exclusive(path: str, baud: int, options: dict[str, Any]) -> Any:
     """A port by its path, opened by nobody else; closing it gives back its lock."""
     lock = FileLock(lock_path(path))

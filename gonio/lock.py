@@ -19,7 +19,17 @@ _NAME_BYTES = 1000
 
 
 class HeldError(Exception):
-    """Another process holds the lock; the message says which: ``process 4711 on bench since 2026-11-28T09:30:00+0100``."""
+    """Another process holds the lock; the message says which: ``process 4711 on bench since 2026-11-28T09:30:00+0100``.
+
+    Attributes
+    ----------
+    pid : int or None
+        Of that process, if it is known and on this machine.
+    """
+
+    def __init__(self, message: str, pid: int | None = None) -> None:
+        super().__init__(message)
+        self.pid = pid
 
 
 class FileLock:
@@ -49,9 +59,9 @@ class FileLock:
         try:
             _lock(file)
         except OSError:
-            holder = _holder(file)
+            error = _holder(file)
             os.close(file)
-            raise HeldError(holder) from None
+            raise error from None
         owner = {"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
         with contextlib.suppress(OSError):  # another user's file holds as well, under the name of its last holder
             os.ftruncate(file, 0)
@@ -94,18 +104,20 @@ def _lock(file: int) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _holder(file: int) -> str:
+def _holder(file: int) -> HeldError:
     """Who says that it holds the lock; a name that is missing, or that of a process that is gone, is waited for."""
     deadline = time.monotonic() + _PATIENCE_S
     while True:
         try:
             owner = json.loads(os.pread(file, _NAME_BYTES, 0))
-            if owner["host"] != socket.gethostname() or _lives(int(owner["pid"])):
-                return f"process {owner['pid']} on {owner['host']} since {owner['since']}"
+            pid, here = int(owner["pid"]), owner["host"] == socket.gethostname()
+            if not here or _lives(pid):
+                name = f"process {pid} on {owner['host']} since {owner['since']}"
+                return HeldError(name, pid if here else None)
         except (OSError, ValueError, KeyError, TypeError):
             pass
         if time.monotonic() > deadline:
-            return "another process"
+            return HeldError("another process")
         time.sleep(_STEP_S)
 
 

@@ -22,6 +22,7 @@ from typing import Protocol
 
 from gonio.errors import DeviceError
 from sim.clock import ScaledClock
+from sim.dynamixel.control_table import BAUD_RATES
 
 IDLE_S = 0.1  # wall time of silence after which servos forget an unfinished packet; they themselves wait 1.5 ms
 
@@ -162,6 +163,15 @@ class _StreamLink:
         raise NotImplementedError
 
 
+def _line_rate(terminal: int) -> int | None:
+    """Rate that the client has set [bit/s]; None if it set none that servos have, as a program that only writes bytes."""
+    import termios
+
+    speed = termios.tcgetattr(terminal)[5]
+    known = {getattr(termios, f"B{rate}", rate): rate for rate in BAUD_RATES}
+    return known.get(speed)
+
+
 class PtyLink(_StreamLink):
     """A device on a pseudo-terminal.
 
@@ -222,6 +232,8 @@ class PtyLink(_StreamLink):
             self.closed = True
             return ()
         if data:
+            if hasattr(self._device, "baudrate"):
+                self._device.baudrate = _line_rate(self._slave)
             self._receive(data)
         return ()
 

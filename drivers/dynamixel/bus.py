@@ -214,7 +214,7 @@ class Bus:
             del self._ticks[servo_id]  # the rig's clock may have stood still; the next question begins anew
         raise ProtocolError(
             f"{self.label(servo_id)}: {self._line.attempts} states in a row are of other times than the questions; "
-            "check the cable, the adapter, and that no two servos share an id."
+            "check the cable, the adapter, that no two servos share an id, and that a simulator runs at speed 1."
         )
 
     def _state(self, servo_id: int, hasty: bool) -> Block:

@@ -51,7 +51,7 @@ def commission(bus: Bus, servo_id: int, settings: Settings) -> dict[str, object]
     """
     identity = _identify(bus, servo_id, settings.model)
     identity |= _check_health(bus, servo_id)
-    _write_eeprom(bus, servo_id, settings)
+    write_eeprom(bus, servo_id, settings)
     if bus.read(servo_id, reg.BUS_WATCHDOG) != 0:  # tripped, or left armed by a process that died
         bus.write(servo_id, reg.BUS_WATCHDOG, 0)
     profile = {
@@ -96,7 +96,8 @@ def _check_health(bus: Bus, servo_id: int) -> dict[str, object]:
     return {"voltage_v": round(volts, 1)}
 
 
-def _write_eeprom(bus: Bus, servo_id: int, settings: Settings) -> None:
+def eeprom_changes(bus: Bus, servo_id: int, settings: Settings) -> dict[reg.Register, tuple[int, int]]:
+    """Registers in EEPROM that differ from the settings: what they hold, and what they should."""
     # `direction` in rig.toml reverses; a time-based profile would take our velocity for milliseconds; torque that
     # comes on with a goal would undo the order in which it is switched on.
     unwanted = reg.DRIVE_REVERSE | reg.DRIVE_TIME_BASED | reg.DRIVE_TORQUE_BY_GOAL
@@ -107,7 +108,13 @@ def _write_eeprom(bus: Bus, servo_id: int, settings: Settings) -> None:
         reg.MAX_POSITION_LIMIT: settings.high,
         reg.MIN_POSITION_LIMIT: settings.low,
     }
-    changes = {register: value for register, value in wanted.items() if bus.read(servo_id, register) != value}
+    found = {register: bus.read(servo_id, register) for register in wanted}
+    return {register: (found[register], value) for register, value in wanted.items() if found[register] != value}
+
+
+def write_eeprom(bus: Bus, servo_id: int, settings: Settings) -> None:
+    """Put the settings into EEPROM, with torque off for a moment if something has to change."""
+    changes = {register: value for register, (_, value) in eeprom_changes(bus, servo_id, settings).items()}
     if not changes:
         return
     if bus.read(servo_id, reg.TORQUE_ENABLE):

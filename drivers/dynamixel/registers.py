@@ -60,6 +60,7 @@ class Register:
 MODEL_NUMBER = Register("Model Number", 0, 2)
 FIRMWARE_VERSION = Register("Firmware Version", 6, 1)
 SERVO_ID = Register("ID", 7, 1)
+BAUD_RATE = Register("Baud Rate", 8, 1)
 RETURN_DELAY_TIME = Register("Return Delay Time", 9, 1, unit="2 us")
 DRIVE_MODE = Register("Drive Mode", 10, 1)
 OPERATING_MODE = Register("Operating Mode", 11, 1)
@@ -93,6 +94,7 @@ PRESENT_VOLTAGE = Register("Present Input Voltage", 144, 2, unit="0.1 V")
 PRESENT_TEMPERATURE = Register("Present Temperature", 146, 1, unit="degC")
 
 POSITION_MODE = 3
+BAUD_CODES = {9_600: 0, 57_600: 1, 115_200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6}
 STATUS_PROFILE_ONGOING = 0x02
 DRIVE_REVERSE, DRIVE_TIME_BASED, DRIVE_TORQUE_BY_GOAL = 0x01, 0x04, 0x08
 

@@ -134,6 +134,16 @@ class Servo:
 
     # -- connection
 
+    @property
+    def id(self) -> int:
+        """On the line."""
+        return self._id
+
+    @property
+    def settings(self) -> Settings:
+        """What the servo is to hold."""
+        return self._settings
+
     def connect(self) -> None:
         """Check that the right, healthy servo answers, put the axis's settings into it, torque on without a jump.
 

@@ -16,7 +16,8 @@ from gonio.errors import EXIT_INTERRUPTED, GonioError
 VERBS: dict[str, tuple[str, str, str]] = {
     "demo": ("gonio.cli.demo", "demo", "The main job end to end on the simulated rig."),
     "init": ("gonio.cli.init", "init", "Write commented rig, plan, scene and fit files into a folder."),
-    "rig": ("gonio.cli.rig", "rig", "Look after a rig: check."),
+    "doctor": ("gonio.cli.doctor", "doctor", "What is wrong with ports, servos, camera and lamp, and what mends it."),
+    "rig": ("gonio.cli.rig", "rig", "Look after a rig: setup, check, home, move, jog, park, stop, watch, dump."),
     "sim": ("gonio.cli.sim", "sim", "The simulated rig as a server for other programs."),
     "scan": ("gonio.cli.scan", "scan_", "Measure the poses of a plan."),
     "resume": ("gonio.cli.scan", "resume", "Go on with an interrupted scan."),

@@ -1,4 +1,4 @@
-"""gonio rig: look after a rig without measuring."""
+"""gonio rig: look after a rig without measuring; here its check, the other verbs in `rig_motion` and `rig_service`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from gonio.cli import rig_motion, rig_service
 from gonio.cli.output import json_option, speaking
 
 
@@ -15,8 +16,15 @@ def rig() -> None:
     """Look after a rig."""
 
 
+for verb in (
+    rig_service.setup, rig_motion.home, rig_motion.move, rig_motion.jog, rig_motion.park, rig_motion.stop,
+    rig_service.watch, rig_service.dump,
+):  # fmt: skip
+    rig.add_command(verb)
+
+
 @rig.command()
-@click.argument("rig_file", metavar="RIG.TOML", type=click.Path(path_type=Path, dir_okay=False))
+@rig_motion.RIG_FILE
 @json_option
 def check(rig_file: Path, as_json: bool) -> None:
     """Open every device of RIG.TOML, read its identity and settings, expose one dark frame; nothing moves."""

@@ -194,6 +194,8 @@ class RigConfig:
         Rest after the axes have settled, for the arm to stop ringing [s].
     moved : float
         Largest change of a joint angle during an exposure [rad]; beyond it the pose is exposed again.
+    park : mapping of axis name to float
+        Where the axes rest [rad].
     zones : tuple of ZoneConfig
         Where parts would collide.
     text : str
@@ -210,6 +212,7 @@ class RigConfig:
     lamp: LampConfig
     white: WhiteConfig
     sim: SimConfig | None
+    park: Mapping[str, float] = field(default_factory=dict)
     zones: tuple[ZoneConfig, ...] = ()
     text: str = field(default="", repr=False, compare=False)
 
@@ -248,6 +251,7 @@ def parse_rig(text: str, name: str = "rig.toml", *, folder: Path | None = None) 
     sim = _sim(root.table("sim", required=False), folder) if "sim" in root else None
     camera = _camera(root.table("camera"), sim)
     lamp = _lamp(root.table("lamp"))
+    white = _white(root.table("white"))
     config = RigConfig(
         name=rig.text("name"),
         g_min=rig.angle("g_min_deg", 8.0, lower=0.0, upper=90.0),
@@ -262,8 +266,9 @@ def parse_rig(text: str, name: str = "rig.toml", *, folder: Path | None = None) 
         axes={axis: _axis(axes.table(axis), axis) for axis in AXES},
         camera=camera,
         lamp=lamp,
-        white=_white(root.table("white")),
+        white=white,
         sim=sim,
+        park=_park(root.table("park", required=False), white),
         zones=tuple(_zone(table) for table in root.tables("zone")),
         text=text,
     )
@@ -395,6 +400,15 @@ def _white(table: Table) -> WhiteConfig:
     return config
 
 
+def _park(table: Table, white: WhiteConfig) -> dict[str, float]:
+    """Joint angles at rest; by default those of the white reference's geometry."""
+    angles = {
+        axis: table.angle(f"{axis}_deg", math.degrees(getattr(white, axis)), lower=-180.0, upper=180.0) for axis in AXES
+    }
+    table.finish()
+    return angles
+
+
 def _zone(table: Table) -> ZoneConfig:
     ranges = {}
     for axis in AXES:
@@ -437,6 +451,12 @@ def _cross_checks(config: RigConfig, root: Table) -> None:
                 "white", f"{name}_deg",
                 f"= {math.degrees(angle):g} is outside the axis' limits [{math.degrees(axis.lower):g}, "
                 f"{math.degrees(axis.upper):g}] degrees; move the reference geometry",
+            )  # fmt: skip
+        elif not axis.lower <= config.park[name] <= axis.upper:
+            root.document.report(
+                "park", f"{name}_deg",
+                f"= {math.degrees(config.park[name]):g} is outside the axis' limits [{math.degrees(axis.lower):g}, "
+                f"{math.degrees(axis.upper):g}] degrees",
             )  # fmt: skip
     if abs(config.white.arm) < config.g_min:
         root.document.report(

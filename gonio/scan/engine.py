@@ -127,7 +127,7 @@ class _Scan:
         self._advice = advice = f"`gonio resume {run.path}` goes on"
 
         def check_stop() -> None:
-            stop.check(advice)
+            stop.check(f"all completed poses are kept; {advice}")
 
         if rig.camera is None:
             raise ConfigurationError('[camera] kind = "none": a scan needs a camera; choose one in rig.toml')

@@ -32,10 +32,10 @@ class Interrupts:
         Parameters
         ----------
         what : str
-            Says what to do next.
+            Says what is kept, and what to do next.
         """
         if self.event.is_set():
-            raise Interrupted(f"stopped by {self.name}: the axes hold, all completed poses are kept; {what}")
+            raise Interrupted(f"stopped by {self.name}: the axes hold, {what}")
 
 
 @contextmanager

@@ -47,12 +47,12 @@ class Motion:
         self._advice = advice
 
     def move(self, goal: Mapping[str, float]) -> dict[str, AxisReading]:
-        """Move all axes, wait until they stand and the arm has stopped ringing; returns where they are.
+        """Move axes, wait until they stand and the arm has stopped ringing; returns where all are.
 
         Parameters
         ----------
         goal : mapping of axis name to float
-            [rad].
+            [rad]; an axis that is not in it stays.
 
         Raises
         ------
@@ -62,9 +62,10 @@ class Motion:
             If an axis cannot get there, or not in time.
         """
         here = {axis: reading.angle for axis, reading in self.read().items()}
-        for part in zones.stages(here, goal, self._config):
-            self._together(here, part)
-            here |= part
+        for part in zones.stages(here, {**here, **goal}, self._config):
+            wanted = {axis: angle for axis, angle in part.items() if axis in goal}
+            self._together(here, wanted)
+            here |= wanted
         self.wait(self._config.settle_s)
         return self.read()
 

@@ -1,6 +1,6 @@
-"""The composition root: opens the devices that a rig file names, real or simulated, behind the same interfaces.
+"""Opens the devices that a rig file names, real or simulated, behind the same interfaces.
 
-It alone knows `drivers` and `sim`, and loads them only when a rig needs them. ``port = "sim"`` starts the simulator: in a
+`drivers` and `sim` are loaded only when a rig needs them. ``port = "sim"`` starts the simulator: in a
 process of its own on pseudo-terminals and a socket, or in this one on a virtual clock. It measures nothing.
 """
 
@@ -18,6 +18,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -151,6 +152,62 @@ def open_rig(config: RigConfig, *, ask: Ask | None = None, faults: bool = True) 
         yield _simulated(config, stack, faults) if config.simulated else _real(config, stack, ask)
 
 
+@dataclass(frozen=True)
+class OpenAxes:
+    """The axes of a rig without its camera and lamp.
+
+    Attributes
+    ----------
+    config : RigConfig
+    clock : Clock
+    bus : Bus
+    axes : dict of str to Servo
+    """
+
+    config: RigConfig
+    clock: Clock
+    bus: Bus
+    axes: dict[str, Servo]
+
+
+@contextmanager
+def open_axes(config: RigConfig, *, connect: bool = True) -> Iterator[OpenAxes]:
+    """Open the servos' line alone; leaving the context closes it, with their torque on.
+
+    Parameters
+    ----------
+    config : RigConfig
+        Of a real rig, or of a simulator that serves its line on a port: what ``port = "sim"`` starts would end with it.
+    connect : bool, optional
+        Check every servo, write the axis's settings and switch its torque on; else nothing is sent.
+
+    Raises
+    ------
+    ConfigurationError
+        If the rig is simulated within gonio.
+    DeviceError
+        If the port or a servo does not answer.
+    """
+    from drivers.dynamixel import Bus
+
+    if config.simulated:
+        raise ConfigurationError(
+            '[bus] port = "sim" is a simulator that lasts for one command; start `gonio sim serve --pty /tmp/bus` beside it '
+            'and write port = "/tmp/bus"'
+        )
+    clock = WallClock()
+    with ExitStack() as stack:
+        bus = Bus(config.bus.port, clock=clock, baud=config.bus.baud, timeout_s=config.bus.timeout_s)
+        stack.callback(bus.close)
+        bus.open()
+        servos = {name: servo_of(bus, axis, config.bus.watchdog_s or None) for name, axis in config.axes.items()}
+        for servo in servos.values():
+            stack.callback(_quietly, servo.close)
+            if connect:
+                servo.connect()
+        yield OpenAxes(config, clock, bus, servos)
+
+
 def serve_simulator(arguments: Sequence[str], announce: Callable[[str], None] | None = None) -> int:
     """Serve a simulated rig until told to stop; see `sim.serve.serve`."""
     from sim.serve import serve
@@ -211,14 +268,15 @@ def _connect(bus: Bus, config: RigConfig, stack: ExitStack, *, watchdog_s: float
     """Open the bus and connect all axes."""
     stack.callback(bus.close)
     bus.open()
-    servos = {name: _servo(bus, axis, watchdog_s) for name, axis in config.axes.items()}
+    servos = {name: servo_of(bus, axis, watchdog_s) for name, axis in config.axes.items()}
     for servo in servos.values():
         stack.callback(_quietly, servo.close)
         servo.connect()
     return dict(servos)
 
 
-def _servo(bus: Bus, axis: AxisConfig, watchdog_s: float | None) -> Servo:
+def servo_of(bus: Bus, axis: AxisConfig, watchdog_s: float | None) -> Servo:
+    """The servo that an axis is; it is not connected yet."""
     from drivers.dynamixel import Servo
 
     return Servo(
