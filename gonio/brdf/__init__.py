@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from gonio.brdf import plugins
 from gonio.brdf.base import BRDF, Model, Parameter, Term, term_names
 from gonio.brdf.families import FAMILIES, Family, find, parse
-from gonio.brdf.function import from_function
+from gonio.brdf.function import from_function, probe
 from gonio.errors import ParameterError
 
 __all__ = ["BRDF", "Family", "Model", "Parameter", "Term", "from_function", "make", "models", "parse", "term_names"]
@@ -29,7 +31,8 @@ def make(name: str | Model, **parameters: Any) -> BRDF:
     Parameters
     ----------
     name : str or Model
-        A key of `models`; or a model of your own.
+        A key of `models`; or a model of your own, whose values are tried for a few hundred directions; errors of integrals
+        over it are estimates.
     **parameters : float or str
         The parameters of the model; angles in radians. Also the choices of models that come in several forms, such as
         ``variant="full"`` of oren_nayar.
@@ -45,11 +48,23 @@ def make(name: str | Model, **parameters: Any) -> BRDF:
     lambertian(albedo=0.8) + ggx(k_s=1, alpha=0.3, f_0=0.04)
     """
     if isinstance(name, Model):
-        return BRDF([Term(name, name.values(parameters))])
+        return _made(name if _built_in(name) else replace(name, own=True), parameters)
+    if not isinstance(name, str):
+        raise ParameterError(f"a BRDF model is named by its name or given as a gonio.brdf.Model, not as {name!r}")
     family = find(name)
     model = family.model(**{key: parameters.pop(key) for key in family.choices if key in parameters})
     unknown = set(parameters) - {parameter.name for parameter in model.parameters}
     for key in sorted(unknown):
         if isinstance(parameters[key], str | bool):
             family.model(**{key: parameters[key]})  # tells which choices there are
-    return BRDF([Term(model, model.values(parameters))])
+    return _made(model, parameters)
+
+
+def _built_in(model: Model) -> bool:
+    family = FAMILIES.get(model.name)
+    return family is not None and family.model(**dict(model.choices)) is model
+
+
+def _made(model: Model, parameters: Mapping[str, Any]) -> BRDF:
+    brdf = BRDF([Term(model, model.values(parameters))])
+    return probe(brdf) if model.own and not model.delta else brdf

@@ -56,20 +56,32 @@ class Parameter:
     fixed: float | None = None
     default: float | None = None
 
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise ParameterError(f"parameter {self.name!r}: its name is used as a keyword; take letters, digits and _")
+        if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
+            raise ParameterError(
+                f"parameter {self.name}: its range {self.lower:g} to {self.upper:g} is none; give a finite lower end below "
+                "the upper one"
+            )
+        if not (isinstance(self.prior, tuple) and len(self.prior) == 3 and self.prior[0] in ("uniform", "log_normal")):
+            raise ParameterError(
+                f'parameter {self.name}: its prior {self.prior!r} is not known; write ("uniform", lower, upper) or '
+                '("log_normal", mean of ln, standard deviation of ln)'
+            )
+        for value in (self.fixed, self.default):
+            if value is not None:
+                self.check(value, f"parameter {self.name}")
+
     def check(self, value: float, owner: str) -> float:
         """The value as float, or a `ParameterError` naming what is allowed."""
+        allowed = f"[{self.lower:g}, {self.upper:g}]" + ("" if self.unit == "1" else f" {self.unit}")
         try:
             number = float("text" if isinstance(value, str | bool) else value)
         except (TypeError, ValueError):
-            raise ParameterError(
-                f"{owner}: {self.name} = {value!r} is not a number; choose one inside [{self.lower:g}, {self.upper:g}] "
-                f"{self.unit}"
-            ) from None
+            raise ParameterError(f"{owner}: {self.name} = {value!r} is not a number; choose one inside {allowed}") from None
         if not (math.isfinite(number) and self.lower <= number <= self.upper):
-            raise ParameterError(
-                f"{owner}: {self.name} = {number:g} is outside [{self.lower:g}, {self.upper:g}] {self.unit}; "
-                "choose one inside"
-            )
+            raise ParameterError(f"{owner}: {self.name} = {number:g} is outside {allowed}; choose one inside")
         return number
 
 
@@ -132,6 +144,11 @@ class Model:
     def __post_init__(self) -> None:
         if self.function is not None and not hasattr(self.function, "py_func"):
             raise ParameterError(f"{self.name}: its function is not compiled; decorate it with @gonio.jit.model")
+        if self.function is not None and self.function.py_func.__code__.co_argcount != 7:
+            raise ParameterError(f"{self.name}: its function takes seven arguments, (xi, yi, zi, xr, yr, zr, p)")
+        names = [parameter.name for parameter in self.parameters]
+        if len(set(names)) != len(names):
+            raise ParameterError(f"{self.name} has two parameters of one name among {', '.join(names)}; rename one")
 
     @property
     def expression(self) -> str:
@@ -219,6 +236,9 @@ class BRDF:
         if not isinstance(other, BRDF):
             return NotImplemented
         return BRDF(self.terms + other.terms)
+
+    def __radd__(self, other: object) -> BRDF:
+        return self if other == 0 else NotImplemented  # sum() begins with 0
 
     def __mul__(self, factor: float) -> BRDF:
         if not isinstance(factor, int | float | np.floating):

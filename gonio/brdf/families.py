@@ -115,6 +115,11 @@ def find(name: str) -> Family:
 
     if name in plugins.names():
         return plugins.load(name)
+    if name == "tabulated":
+        raise ParameterError(
+            "a tabulated BRDF has no parameters: it is read from a file by gonio.formats.read(path).brdf() or tabulated by "
+            "gonio.brdf.tabulated.from_brdf and tabulate"
+        )
     known = sorted({*FAMILIES, *plugins.names()})
     raise ParameterError(f"there is no BRDF model {name!r}{_suggest(name, known)}; known are: {', '.join(known)}")
 

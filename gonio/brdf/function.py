@@ -91,6 +91,27 @@ def from_function(
     return brdf
 
 
+def probe(brdf: BRDF) -> BRDF:
+    """The BRDF of one term that is not gonio's own, once its function has compiled and its values are a BRDF's.
+
+    Raises
+    ------
+    ParameterError
+        If not; the message says what is wrong, or where.
+    """
+    import numba
+
+    name = brdf.terms[0].model.name
+    try:
+        _probe(brdf, name)
+    except numba.errors.NumbaError as exc:
+        lines = [line.strip() for line in str(exc).splitlines() if line.strip()]
+        told = next((line for line in lines if not line.startswith(("Failed in", "During", "File"))), lines[0])
+        told = told.rstrip(".")
+        raise ParameterError(f"{name}: its function does not compile, {told}; write plain arithmetic and math") from exc
+    return brdf
+
+
 def _arity(function: Callable[..., Any], name: str) -> int:
     try:
         parameters = inspect.signature(function).parameters.values()

@@ -78,6 +78,7 @@ def test_sums_scales_and_names() -> None:
         "lambertian.albedo", "ggx.k_s", "ggx.alpha", "ggx.f_0", "ggx2.k_s", "ggx2.alpha", "ggx2.f_0",
     ]  # fmt: skip
     assert [m.name for m in gonio.brdf.parse("lambertian + ggx")] == ["lambertian", "ggx"]
+    assert sum([paper, gloss]).terms == (paper + gloss).terms
     assert paper.f_r(np.zeros((3, 1)), 0.0, np.zeros(4), 0.0).shape == (3, 4)
 
 

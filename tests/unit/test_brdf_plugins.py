@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import gonio
+from gonio import jit
 from gonio.brdf import Model, Parameter
 from gonio.brdf.plugins import GROUP
 from gonio.errors import ParameterError
@@ -125,3 +129,61 @@ def test_a_function_that_is_not_compiled_is_told() -> None:
 def test_a_model_needs_no_name_to_be_made() -> None:
     own = gonio.brdf.models()["lambertian"]
     assert gonio.brdf.make(own, albedo=0.3).parameters() == {"lambertian.albedo": 0.3}
+
+
+@jit.model
+def _undefined(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
+    return nowhere(p[0])  # type: ignore[name-defined, no-any-return]  # noqa: F821
+
+
+@jit.model
+def _logarithm(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
+    return math.log(p[0])
+
+
+@jit.model
+def _of_six(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float) -> float:
+    return 0.1
+
+
+def _share(**given: Any) -> Parameter:
+    return Parameter(**{"name": "a", "lower": 0.0, "upper": 1.0, "doc": "", "prior": ("uniform", 0.0, 1.0), **given})
+
+
+def _declared(function: Any, *parameters: Parameter) -> Model:
+    return Model(name="mine", parameters=parameters or (_share(),), function=function, doc="", reference="")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (lambda: _share(lower=1.0), "range 1 to 1 is none"),
+        (lambda: _share(prior=("normal", 0.0, 1.0)), "its prior .* is not known; write"),
+        (lambda: _share(name="a b"), "used as a keyword"),
+        (lambda: _share(default=3.0), r"a = 3 is outside \[0, 1\]; choose"),
+        (lambda: _declared(_of_six), "takes seven arguments"),
+        (lambda: _declared(_logarithm, _share(), _share()), "two parameters of one name"),
+        (lambda: gonio.brdf.make(_declared(_logarithm), a=0.5), r"mine: f_r = -0.69\d+ 1/sr at omega_i"),
+        (lambda: gonio.brdf.make(_declared(_logarithm), a=0.0), "mine: f_r = -inf 1/sr"),
+        (lambda: gonio.brdf.make(_declared(_undefined), a=0.5), "not compile, NameError: name 'nowhere' is not defined"),
+        (lambda: gonio.brdf.make(3), "named by its name"),
+        (lambda: gonio.brdf.make("tabulated"), "is read from a file"),
+    ],
+)
+def test_mistakes_of_a_first_model_are_one_sentence(mistake: Callable[[], object], words: str) -> None:
+    with pytest.raises(ParameterError, match=words) as told:
+        mistake()
+    assert "\n" not in str(told.value)
+
+
+def test_errors_over_models_that_are_not_gonios_own_are_estimates() -> None:
+    matt = _declared(_constant)
+    albedo = gonio.directional_albedo(gonio.brdf.make(matt, a=0.5), 0.3)
+    assert float(albedo.value) == pytest.approx(0.5, rel=1e-6) and not albedo.error_is_bound
+    own = gonio.brdf.make(gonio.brdf.parse("oren_nayar[variant=full]")[0], albedo=0.5, sigma=0.2)
+    assert not own.terms[0].model.own
+
+
+@jit.model
+def _constant(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
+    return p[0] / math.pi if (zi > 0.0) & (zr > 0.0) else 0.0
