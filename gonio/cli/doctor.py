@@ -23,7 +23,7 @@ def doctor(rig_file: Path | None, as_json: bool) -> None:
 
     with speaking(as_json) as output:
         findings = []
-        for finding in examine(None if rig_file is None else load_rig(rig_file)):
+        for finding in examine(None if rig_file is None else load_rig(rig_file), str(rig_file)):
             findings.append(finding)
             output.say(f"{'WRONG' if finding.mend else 'ok   '}  {finding.subject}: {finding.state}")
             if finding.mend:

@@ -59,6 +59,6 @@ def check(rig_file: Path, as_json: bool) -> None:
                     f"camera: {camera.name}, {width} x {height} pixels, {frame.bit_depth} bit, "
                     f"{'linear' if frame.linear else 'NOT LINEAR'}, {frame.data.mean():.1f} DN at {frame.exposure_s:g} s"
                 )
-            output.say(f"lamp: {opened.lamp.name}, {opened.lamp.describe().get('identity', '')}")
+            output.say(f"lamp: {opened.lamp.describe().get('identity') or opened.lamp.name}")
             output.say("all devices answer")
             output.result(**opened.describe())

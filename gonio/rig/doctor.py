@@ -39,8 +39,8 @@ class Finding:
     mend: str = ""
 
 
-def examine(config: RigConfig | None = None) -> Iterator[Finding]:
-    """Findings about this computer, and about a rig if one is given; each as soon as it is known."""
+def examine(config: RigConfig | None = None, file: str = "RIG.TOML") -> Iterator[Finding]:
+    """Findings about this computer, and about a rig, read from `file`, if one is given; each as soon as it is known."""
     ports = dict(_ports())
     real = config is not None and not config.simulated
     if real and config is not None and "://" not in config.bus.port:
@@ -52,7 +52,7 @@ def examine(config: RigConfig | None = None) -> Iterator[Finding]:
         yield from _latency(path)
     yield from _cameras(needed=config is None or config.camera.kind == "opencv")
     if real and config is not None:
-        yield from _servos(config)
+        yield from _servos(config, f"gonio rig setup {file}")
         yield from _lamp(config)
 
 
@@ -116,11 +116,10 @@ def _cameras(*, needed: bool) -> Iterator[Finding]:
         yield Finding("cameras", "none that Linux lists", mend)
 
 
-def _servos(config: RigConfig) -> Iterator[Finding]:
+def _servos(config: RigConfig, setup: str) -> Iterator[Finding]:
     from drivers.dynamixel import registers as reg
 
     names = {model.number: model.name for model in reg.MODELS.values()}
-    setup = "gonio rig setup RIG.TOML"
     try:
         with service.bus_at(config)(config.bus.baud) as bus:
             found = bus.scan()
