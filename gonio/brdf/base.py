@@ -100,6 +100,10 @@ class Model:
     lobe_width : callable, optional
         Of the parameter array: half width [rad] of the narrowest structure around the mirror direction, in half-vector
         angle; the integrator lays its nodes by it. None: no lobe.
+    layer_width : callable, optional
+        Of the parameter array: height [rad] above the horizon within which f_r, as a function of omega_i, changes, where the
+        lobe's width and a grazing view do not tell. A broken power of mu_i has structure at every height: give the height
+        up to which its integral is nothing. Goes with `lobe_width`.
     kinks : callable, optional
         ``(p, omega_r (..., 3)) -> (..., k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which
         f_r or a derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels
@@ -129,6 +133,7 @@ class Model:
     doc: str
     reference: str
     lobe_width: Callable[[Array], float] | None = None
+    layer_width: Callable[[Array], float] | None = None
     kinks: Callable[[Array, Array], Array] | None = None
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None
@@ -191,6 +196,11 @@ class Term:
     def lobe_width(self) -> float | None:
         """Half width of the term's lobe [rad], None without one."""
         return None if self.model.lobe_width is None else float(self.model.lobe_width(self.values))
+
+    def layer_width(self) -> float:
+        """Height of the structure at the horizon [rad]: at most the lobe's width, or 1."""
+        width = self.lobe_width() or 1.0
+        return width if self.model.layer_width is None else min(width, float(self.model.layer_width(self.values)))
 
     @property
     def plain(self) -> bool:

@@ -199,6 +199,11 @@ def _width(p: Array) -> float:
     return 1.0
 
 
+def _layer_2002(p: Array) -> float:
+    """mu_i H has a term mu_i^2 ln mu_i, nothing below this height."""
+    return 1e-5 if p[0] > 0.0 else 1.0
+
+
 def _tau(p: Array) -> Array:
     return np.array([math.tan(p[5])])
 
@@ -220,6 +225,7 @@ def hapke(H: str) -> Model:
         doc=f"Particulate surface: phase function, opposition peak, multiple scattering (H of {H}), roughness.",
         reference="Hapke, J. Geophys. Res. 86, 1981; Icarus 59, 1984; Icarus 67, 1986; Icarus 157, 2002",
         lobe_width=_width,
+        layer_width=_layer_2002 if H == "2002" else None,
         kinks=_kinks,
         features=_features,
         derived=_tau,

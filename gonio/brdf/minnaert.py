@@ -35,9 +35,14 @@ def minnaert_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: floa
     return albedo * INV_PI * power(product, k - 1.0) if lit else 0.0
 
 
-def _features(p: Array, omega_r: Array) -> Array:
-    """The horizon as a whole: mu_i^(k - 1) has no derivatives there, and only cells halved until they agree see it."""
-    return np.empty((0, 4)) if p[1] in (1.0, 2.0) else np.array([[0.0, 0.0, 1.0, 0.5 * math.pi]])
+def _width(p: Array) -> float:
+    """No lobe; but mu_i^k has no derivatives at the horizon, which lobes have layers at too."""
+    return 1.0
+
+
+def _layer(p: Array) -> float:
+    """Below it, mu_i^k is nothing; with k = 0, 1 or 2 it is a polynomial."""
+    return 1.0 if p[1] in (0.0, 1.0, 2.0) else 1e-8
 
 
 MINNAERT = Model(
@@ -49,6 +54,7 @@ MINNAERT = Model(
     function=minnaert_f_r,
     doc="albedo / pi (cos theta_i cos theta_r)^(k - 1); infinite at the horizon for k < 1.",
     reference="Minnaert, Astrophysical Journal 93, 1941",
-    features=_features,
+    lobe_width=_width,
+    layer_width=_layer,
     energy_bounded=False,
 )

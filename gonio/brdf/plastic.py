@@ -83,6 +83,16 @@ def plastic_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float
     return value if lit else 0.0
 
 
+def _width(p: Array) -> float:
+    """No lobe, but a layer at the horizon."""
+    return 1.0
+
+
+def _layer(p: Array) -> float:
+    """Fresnel's reflectance rises within m = (n^2 - 1)^(1/2) of the horizon."""
+    return max(math.sqrt((p[1] - 1.0) * (p[1] + 1.0)), 1e-5)
+
+
 def _scale(p: Array) -> Array:
     """rho / (pi n^2 (1 - rho F_int))."""
     albedo, n = float(p[0]), float(p[1])
@@ -108,6 +118,8 @@ PLASTIC = Model(
     function=plastic_f_r,
     doc="Diffuse base below a smooth dielectric surface, without the gloss.",
     reference="Wolff, JOSA A 11, 1994; Duntley, JOSA 32, 1942",
+    lobe_width=_width,
+    layer_width=_layer,
     derived=_scale,
     derived_slopes=_scale_slopes,
 )

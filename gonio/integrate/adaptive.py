@@ -340,7 +340,7 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
             raise ParameterError(f"{term.model.name}: {len(kinks)} planes of kinks; at most {MOST_PLANES} can be broken at")
         own.append(np.column_stack((kinks[:, :3], np.arccos(kinks[:, 3]))).tolist())
         # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
-        layer = max(1e-9, min(float(fixed[k, 2]), term.lobe_width() or 1.0))
+        layer = max(1e-9, min(float(fixed[k, 2]), term.layer_width()))
         own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
         if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < 0.05:
             own.append(_streak(fixed[k], max(1e-9, (term.lobe_width() or 1.0) * float(fixed[k, 2]))))

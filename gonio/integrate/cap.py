@@ -241,11 +241,11 @@ def ring_eps(t, st, ct, cos_n, sin_n, t_m, about_normal, width):  # type: ignore
 
 
 @jit.model
-def ring_features(cos_n, sin_n, about_normal, width, planes, g, features):  # type: ignore[no-untyped-def]
+def ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features):  # type: ignore[no-untyped-def]
     """Where the integrand across the rings needs nodes: cuts, the lobe, layers at the horizon, kinks."""
     gamma, delta, t_end, t_m, chi_m = g[9], g[10], g[11], g[12], g[13]
     lobe = width < 10.0
-    layer = max(min(width, cos_n), 1e-15)
+    layer = max(min(depth, cos_n), 1e-15)
     n = 0
     if delta < math.pi:
         for k in range(3):
@@ -256,7 +256,9 @@ def ring_features(cos_n, sin_n, about_normal, width, planes, g, features):  # ty
                 st, ct = math.sin(t), math.cos(t)
                 eps = ring_eps(t, st, ct, cos_n, sin_n, t_m, about_normal, width)
                 scale = 0.5 * (far * far + 4.0 * eps * eps) * abs(st) * math.sin(gamma) / max(math.sin(delta), 1e-300)
-                if not about_normal:
+                if about_normal:  # so that the horizon's layer, however thin, leaves the square root a panel
+                    scale = min(scale, 0.5 * abs(HALF_PI - t))
+                else:
                     scale = min(scale, layer)
                 scale = max(scale, 1e-15)
             n = add(features, n, t, scale, True, t_end)
@@ -345,16 +347,19 @@ def arcs(t, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-de
 
 @jit.model
 def element_nodes(  # type: ignore[no-untyped-def]
-    cos_n, sin_n, axis, half_angle, about_normal, width, planes, symmetric, x, w, scratch, nodes, count
+    cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, scratch, nodes, count
 ):
-    """Append the nodes of one element to `nodes` (NODE_ROWS, ...); the new count, or -1 if they don't fit."""
+    """Append the nodes of one element to `nodes` (NODE_ROWS, ...); the new count, or -1 if they don't fit.
+
+    `width` is the lobe's, `depth` that of the structure at the horizon [rad].
+    """
     g, features, panels, points, cosines, sines, arc = scratch
     frame(cos_n, sin_n, axis[0], axis[1], axis[2], half_angle, about_normal, g)
     ux, uy, uz, vx, vy, vz, px, py, pz = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]
     ax, ay, az, t_m, chi_m = axis[0], axis[1], axis[2], g[12], g[13]
     lobe = width < 10.0
-    layer = max(min(width, cos_n), 1e-15)
-    n_features = ring_features(cos_n, sin_n, about_normal, width, planes, g, features)
+    layer = max(min(depth, cos_n), 1e-15)
+    n_features = ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features)
     n_panels = split(features, n_features, g[11], panels)
     cm, sm = math.cos(chi_m), math.sin(chi_m)
     half = 2.0 if symmetric else 1.0
@@ -411,7 +416,9 @@ def element_nodes(  # type: ignore[no-untyped-def]
     return count
 
 
-def _ring_nodes(cos_n, sin_n, axis, half_angle, about_normal, width, planes, symmetric, x, w, nodes, starts):  # type: ignore[no-untyped-def]
+def _ring_nodes(  # type: ignore[no-untyped-def]
+    cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, nodes, starts
+):
     size = 2 * MAX_ARCS * x.size
     scratch = (
         np.empty(14), np.empty((MAX_FEATURES, 3)), np.empty((MAX_PANELS, 6)), np.empty(MAX_ARCS),
@@ -421,7 +428,7 @@ def _ring_nodes(cos_n, sin_n, axis, half_angle, about_normal, width, planes, sym
     starts[0] = 0
     for k in range(cos_n.size):
         more = element_nodes(
-            cos_n[k], sin_n[k], axis[k], half_angle, about_normal[k], width, planes[k], symmetric[k],
+            cos_n[k], sin_n[k], axis[k], half_angle, about_normal[k], width, depth, planes[k], symmetric[k],
             x, w, scratch, nodes, count,
         )  # fmt: skip
         if more < 0:

@@ -91,7 +91,7 @@ def add(
     floor = _NOTHING * math.pi * math.sin(cap.half_angle) ** 2
     worst = _kernel(term.model.function)(
         gradients.p, gradients.q, *tile, np.array(cap.axis), cap.half_angle, cap.radiance * term.weight,
-        term.lobe_width() or 10.0, term.values, nodes, starts, np.array(_DEGREES, dtype=float),
+        term.lobe_width() or 10.0, term.layer_width(), term.values, nodes, starts, np.array(_DEGREES, dtype=float),
         x, w, cuts, planes, rtol, floor, value, error, left, crossed, counts,
     )  # fmt: skip
     rest, nodes_used = left[: counts[0]].astype(np.intp), int(counts[1])
@@ -173,8 +173,8 @@ def _kernel(function: Any) -> Any:
         return -1.0
 
     def disks(  # type: ignore[no-untyped-def]
-        p, q, start, stop, axis, half_angle, scale, width, parameters, nodes, starts, degrees, x, w, cuts, planes, rtol,
-        floor, value, error, left, crossed, counts,
+        p, q, start, stop, axis, half_angle, scale, width, depth, parameters, nodes, starts, degrees, x, w, cuts, planes,
+        rtol, floor, value, error, left, crossed, counts,
     ):  # fmt: skip
         columns, worst, rules, kinks = p.shape[1], 0.0, degrees.size, planes.shape[1]
         dx, dy, dz = axis[0], axis[1], axis[2]
@@ -195,7 +195,7 @@ def _kernel(function: Any) -> Any:
                     continue
                 # squared distances from the axis: of the lobe, |m - axis|, and of the horizon's layer
                 lobe = (ax - s) ** 2 + ay * ay + (az - c) ** 2 + (2.0 * width * c) ** 2
-                layer = min(width, c)
+                layer = min(depth, c)
                 if width >= 10.0:
                     lobe, layer = 1.0, c if kinks else 1.0
                 far = math.sqrt(min(lobe, 1.0)) * _FINER / half_angle

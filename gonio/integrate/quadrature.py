@@ -62,6 +62,7 @@ class _Scene(NamedTuple):
     axis: Array
     about_normal: NDArray[np.bool_]
     width: float
+    depth: float
     planes: Array
     symmetric: NDArray[np.bool_]
 
@@ -171,7 +172,7 @@ def _scene(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) 
         local = (inside > 10.0) | (inside < least) | (elements.cos_theta < 0.2)
     symmetric = (axis[:, 1] == 0.0) & term.model.isotropic & (not term.model.own)
     cos_n = np.maximum(elements.cos_theta, _LIMB)
-    return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, planes, symmetric)
+    return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, term.layer_width(), planes, symmetric)
 
 
 def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
@@ -238,8 +239,8 @@ def _tile(scene: _Scene, active: NDArray[np.intp], out: Array, order: int, size:
     while done < index.size:
         rest = slice(done, None)
         m = ring_nodes(
-            cos_n[rest], sin_n[rest], axis[rest], scene.cap.half_angle, local[rest], scene.width, planes[rest],
-            symmetric[rest], x, w, nodes, starts,
+            cos_n[rest], sin_n[rest], axis[rest], scene.cap.half_angle, local[rest], scene.width, scene.depth,
+            planes[rest], symmetric[rest], x, w, nodes, starts,
         )  # fmt: skip
         if m == 0:  # one element alone needs more
             if nodes.shape[1] >= _LARGEST:

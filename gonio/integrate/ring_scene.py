@@ -65,7 +65,7 @@ class Scene:
     def _layers(self, cosine: Array) -> Array:
         """Width of the structure at the surface's horizon [rad]."""
         if self.width < NONE:
-            return np.maximum(np.minimum(self.width, cosine), 1e-9)
+            return np.maximum(np.minimum(self.term.layer_width(), cosine), 1e-9)
         if self.term.model.diffuse:
             return np.full(len(cosine), NONE)
         return np.maximum(cosine, 1e-9)
