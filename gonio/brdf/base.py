@@ -121,6 +121,8 @@ class Model:
     diffuse : bool
         f_r is the same for all pairs of directions (Lambert).
     isotropic, reciprocal, energy_bounded : bool
+    pieces : bool
+        f_r is made of pieces, a table's cells, at whose borders a higher derivative jumps.
     choices : mapping of str to str
         What tells this model from others of its name and is not the default: ``{"variant": "full"}``.
     own : bool
@@ -143,6 +145,7 @@ class Model:
     isotropic: bool = True
     reciprocal: bool = True
     energy_bounded: bool = True
+    pieces: bool = False
     choices: Mapping[str, str] = field(default_factory=dict)
     own: bool = False
 

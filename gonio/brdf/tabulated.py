@@ -119,6 +119,7 @@ TABULATED = Model(
     reference="Rusinkiewicz, Eurographics Workshop on Rendering, 1998",
     lobe_width=_lobe_width,
     energy_bounded=False,
+    pieces=True,
 )
 
 

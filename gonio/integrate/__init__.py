@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -143,7 +144,7 @@ def scene_radiance(
         Polar angles of the surface normal [rad], 0 <= theta_n < pi/2.
     form : {"local", "viewer"}
         Polar coordinates about the surface normal, or about the axis of each part of the source, which for uniform and
-        hemispherical sources is the viewer's.
+        hemispherical sources and for radiance fields is the viewer's.
     rtol : float, optional
         Relative error requested.
     tangent : array_like, broadcasts with theta_n and phi_n, optional
@@ -169,11 +170,8 @@ def scene_radiance(
         elements = upright if step.term.model.isotropic else grained
         if isinstance(step.part, Collimated):
             raise ParameterError("a collimated beam is a delta function: its integral is closed form 14a, not a quadrature")
-        if isinstance(step.part, Field):
-            v, e = over_field(step.term, step.part, elements, rtol=rtol, atol=0.0, effort=step.effort)
-            value, error = value + v, error + e
-            continue
-        v, e = integrate_cap(
+        by_quadrature: Any = over_field if isinstance(step.part, Field) else integrate_cap
+        v, e = by_quadrature(
             step.term, step.part, elements, rtol=rtol, atol=0.0, about_normal=form == "local", effort=step.effort
         )
         value, error = value + v, error + e

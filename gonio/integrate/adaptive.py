@@ -165,9 +165,20 @@ def over_cap(
 
 
 def over_field(
-    term: Term, field: Field, elements: Elements, *, rtol: float, atol: float, effort: Counter
+    term: Term,
+    field: Field,
+    elements: Elements,
+    *,
+    rtol: float,
+    atol: float,
+    effort: Counter,
+    about_normal: bool | None = None,
 ) -> tuple[Array, Array]:
-    """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared."""
+    """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared.
+
+    Polar coordinates about the normal, or else about the field's own pole; by default the pole for an environment map, whose
+    rows are rings about it, and the normal for the others.
+    """
     n = len(elements)
     # (n, 3, 3), from viewer-oriented to local
     turn = np.stack([elements.local(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
@@ -175,7 +186,8 @@ def over_field(
     def radiance(directions: Array, element: Index) -> Array:
         return field.at(np.einsum("ij,ijk->ik", directions, turn[element]))
 
-    light, region = Light(radiance), Region(turn[:, :, 2], math.pi, True)
+    light = Light(radiance)
+    region = Region(turn[:, :, 2], math.pi, not isinstance(field, EnvironmentMap) if about_normal is None else about_normal)
     if isinstance(field, Lobes):
         lit = field.amplitude > 0
         peaks = np.einsum("nij,fj->nfi", turn, field.axes()[lit])
@@ -188,7 +200,6 @@ def over_field(
         fixed = np.array(circles)
         centres = np.einsum("nij,fj->nfi", turn, fixed[:, :3])
         light = light._replace(planes=np.concatenate((centres, np.tile(fixed[None, :, 3:], (n, 1, 1))), axis=2))
-        region = Region(turn[:, :, 2], math.pi, False)
     else:
         light = light._replace(detail=field.detail)
     return integrate(term, elements.viewer(), region, light, rtol=rtol, atol=atol, effort=effort)
@@ -286,6 +297,8 @@ class _Block:
             split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
             split &= np.minimum(self.box[:, 1] - self.box[:, 0], self.box[:, 3] - self.box[:, 2]) > _DEEPEST
             if not np.any(split):
+                if self.term.model.pieces:
+                    total, missing = self._confirm(total)
                 relative = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0))
                 return total, missing + relative * np.abs(total)
             ways = np.where(along > 4 * across, 1, np.where(across > 4 * along, 2, 3)) * split
@@ -295,6 +308,15 @@ class _Block:
             spent += np.bincount(self.owner[base], minlength=n)
             self.base, self.box = np.concatenate((self.base[keep], base)), np.concatenate((self.box[keep], box))
             value, along, across = (np.concatenate((o[keep], f)) for o, f in zip((value, along, across), fresh, strict=True))
+
+    def _confirm(self, before: Array) -> tuple[Array, Array]:
+        """All cells halved once more, for models with small pieces that both rules of a cell may have missed."""
+        self.base, self.box = _halve(self.base, self.box, np.full(len(self.base), 3))
+        value, along, across = self._evaluate(self.base, self.box)
+        total, missing = (
+            np.bincount(self.owner[self.base], of, minlength=len(before)).astype(float) for of in (value, along + across)
+        )
+        return total, np.maximum(missing, 0.5 * np.abs(total - before))
 
     def _evaluate(self, base: Index, box: Array) -> tuple[Array, Array, Array]:
         """Value of each cell, and its errors along t and along chi."""

@@ -36,6 +36,7 @@ _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
 _TILE = 1 << 15  # nodes evaluated at once: they stay in the cache
 _WORTH = 1 << 17  # nodes below which several threads gain nothing
 _LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
+_FEW = 64  # surface elements up to which cells are tried where no order suits a model made of pieces
 _NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
 _BROAD = 0.5  # lobe width [rad] from which a lobe does not matter for that choice
 
@@ -136,15 +137,16 @@ def integrate_cap(
         totals[0, active] = now
         value[active] = now
         allowed = np.maximum(rtol * np.abs(now), atol)
-        estimate, rounding = _estimate(totals[:, active]), unit[active] * np.abs(now)
+        estimate, rounding = _estimate(totals[:, active], term.model.pieces), unit[active] * np.abs(now)
         done[active] = estimate + rounding <= (0.25 if cautious else 1.0) * allowed
         error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
         if np.all(done):
             break
-    rest = np.flatnonzero(~done | crossed)
-    if kinked and rest.size:  # edges that cross
+    rest = np.flatnonzero(crossed | ~done)
+    if (kinked or (term.model.pieces and cautious and rest.size <= _FEW)) and rest.size:  # edges that cross or are not known
+        local = about_normal is not False
         value[rest], error[rest] = over_cap(
-            term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=True, effort=effort
+            term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort
         )
     return value, error
 
@@ -207,10 +209,15 @@ def _first_orders(scene: _Scene, rtol: float) -> NDArray[np.intp]:
     return np.maximum(start, np.minimum(np.searchsorted(ORDERS, needed), len(ORDERS) - 3))
 
 
-def _estimate(totals: Array) -> Array:
-    """Error of the newest of a series of results of rising order, shape (k, n), newest first, NaN before the first."""
+def _estimate(totals: Array, pieces: bool) -> Array:
+    """Error of the newest of a series of results of rising order, shape (k, n), newest first, NaN before the first.
+
+    Of a model made of pieces the differences fall by chance: the largest of the last three counts.
+    """
     steps = np.abs(np.diff(totals, axis=0))
     step, earlier, third = steps[:3]
+    if pieces:
+        return np.where(np.isnan(third), np.inf, np.max(steps[:3], axis=0))
     largest = np.max(np.nan_to_num(steps), axis=0)
     converging = (step < 0.1 * earlier) & (np.isnan(third) | (earlier < 0.5 * third))
     slow = np.maximum(np.maximum(step, earlier), 0.5 * largest)
