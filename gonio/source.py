@@ -322,7 +322,21 @@ def make(kind: str, **parameters: object) -> Source:
     missing = [n for n, p in signature.parameters.items() if p.default is inspect.Parameter.empty and n not in parameters]
     if missing:
         raise ParameterError(f"{kind} needs {', '.join(missing)} as well")
+    for name, value in parameters.items():
+        _check_type(f"{kind}: {name}", value, str(signature.parameters[name].annotation))
     return _KINDS[kind](**parameters)
+
+
+def _check_type(what: str, value: object, annotation: str) -> None:
+    """What is no number is told by name; environment maps and functions look at theirs themselves."""
+    try:
+        if annotation == "float" or (annotation == "float | None" and value is not None):
+            float(value)  # type: ignore[arg-type]
+        elif annotation in ("ArrayLike", "Sequence[float]"):
+            np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        noun = "number" if annotation.startswith("float") else "number or list of numbers"
+        raise ParameterError(f"{what} = {value!r} is no {noun}") from None
 
 
 def _direction(theta: float, phi: float) -> tuple[float, float, float]:

@@ -147,6 +147,29 @@ def test_what_is_no_radiance_is_told(kind: str, parameters: dict[str, object], m
         make(kind, **parameters)
 
 
+GOOD: dict[str, dict[str, object]] = {
+    "collimated": {"theta": 0.3, "phi": 1.0, "irradiance": 1.0},
+    "uniform": {"radiance": 1.0},
+    "hemispherical": {"radiance": 1.0, "axis": (0.0, 0.0, 1.0)},
+    "disk": {"theta": 0.3, "phi": 1.0, "half_angle": 0.1, "radiance": 1.0},
+    "overcast": {"zenith_radiance": 1.0, "axis": (0.0, 0.0, 1.0)},
+    "lobes": {"amplitude": 1.0, "kappa": 5.0, "theta": 0.3, "phi": 1.0},
+    "spherical_harmonics": {"coefficients": [1.0]},
+}
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1.0, "bright", [[1.0, 2.0], [3.0]]], ids=str)
+@pytest.mark.parametrize("kind", GOOD)
+def test_no_parameter_of_a_source_takes_what_is_no_number(kind: str, bad: object) -> None:
+    """NaN, infinite, negative, a text, a list of lists; the message has the parameter's name. Azimuths may be negative."""
+    for name, value in GOOD[kind].items():
+        if bad == -1.0 and name in ("phi", "axis"):
+            continue
+        given = bad if not isinstance(value, tuple | list) else [bad, *value[1:]]
+        with pytest.raises((ParameterError, GeometryError), match=name.replace("coefficients", "coefficient|radiance")):
+            make(kind, **{**GOOD[kind], name: given})
+
+
 def test_a_function_that_turns_negative_later_is_told() -> None:
     paper = gonio.brdf.make("lambertian", albedo=0.5)
     with pytest.raises(ParameterError, match="must be finite"):
