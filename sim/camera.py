@@ -3,13 +3,10 @@
 `SimulatedCamera` works in this process on any clock; `SocketCamera` asks one in another process over a local socket.
 Both satisfy `gonio.interfaces.Camera`, and both can change the specimen, which a person does on a real rig.
 
-The sensor is linear. The noise of a frame depends on the seed and on the frame's label and on nothing else: the frame
-of a pose is the same whether the scan was interrupted before it or not. The specimen is seen where it is in the middle
-of the exposure; motion blur is not modelled, nor are defective pixels, a non-uniform response, blooming, stale frames.
-
-References
-----------
-EMVA Standard 1288, release 4.0, section 2: linear camera model (photon noise, read noise, gain, quantisation).
+The noise of a frame depends on the seed and on the frame's label and on nothing else: the frame of a pose is the same
+whether the scan was interrupted before it or not. The specimen is seen where it is in the middle of the exposure; motion
+blur is not modelled. What the sensor does is in `sim.chip`; a camera behind ``cv2.VideoCapture``, with its stale frames
+and its automatic exposure, is `sim.capture`. What was true is logged with every frame.
 """
 
 from __future__ import annotations
@@ -17,7 +14,9 @@ from __future__ import annotations
 import json
 import math
 import socket
+from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,8 @@ from numpy.typing import NDArray
 
 from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError, ProtocolError
 from gonio.interfaces import Clock, Frame
+from sim.chip import Chip
+from sim.render import radiance
 from sim.world import World, generator
 
 EXPOSURES_S = (1e-6, 60.0)
@@ -49,25 +50,23 @@ class SimulatedCamera:
         How many were taken.
     unplugged : bool
         The camera does not answer any more.
+    spoil : str or None
+        ``"torn"`` or ``"repeated"``: what is wrong with the next frame.
+    log : deque of dict
+        What was true at the middle of each exposure, with its label; the latest 100 000.
     """
 
     def __init__(self, world: World, clock: Clock, before_exposure: Callable[[str], None] | None = None) -> None:
         self.world = world
         self.frames = 0
         self.unplugged = False
+        self.spoil: str | None = None
+        self.log: deque[dict[str, Any]] = deque(maxlen=100_000)
         self._clock = clock
         self._before_exposure = before_exposure
-        sensor = world.settings.sensor
-        # Pixel (row, column) looks at this place in the plane z = 0: x to the right, y up.
-        x = (np.arange(sensor.width) - 0.5 * (sensor.width - 1)) * sensor.pixel_mm
-        y = (0.5 * (sensor.height - 1) - np.arange(sensor.height)) * sensor.pixel_mm
-        rays = np.empty((sensor.height, sensor.width, 3))
-        rays[..., 0], rays[..., 1], rays[..., 2] = x, y[:, None], -sensor.distance_mm
-        length = np.sqrt(np.einsum("ijk,ijk->ij", rays, rays))
-        self._rays = (rays / length[..., None]).reshape(-1, 3)
-        self._eye = np.array([0.0, 0.0, sensor.distance_mm])
-        # Image irradiance falls off with cos^4 of the field angle (Horn and Sjoberg, 1979, section 9).
-        self._rate_per_radiance = sensor.responsivity * (sensor.distance_mm / length).ravel() ** 4
+        self.chip = Chip(world.settings.sensor, world.settings.seed)
+        self._rendered: tuple[object, NDArray[np.float64]] | None = None
+        self._previous: NDArray[np.uint16] | None = None
 
     @property
     def name(self) -> str:
@@ -75,8 +74,8 @@ class SimulatedCamera:
         return "simulated camera"
 
     def mount(self, specimen: str) -> None:
-        """Put ``"sample"``, ``"white"`` or ``"trap"`` on the stage."""
-        self.world.mount(specimen)
+        """Put ``"sample"``, ``"white"``, ``"board"`` or ``"trap"`` on the stage."""
+        self.world.mount(specimen, self._clock.now())
 
     def truth(self) -> dict[str, Any]:
         """What the measurement has to find out; no real camera tells."""
@@ -93,7 +92,7 @@ class SimulatedCamera:
             "distance_mm": sensor.distance_mm,
             "bit_depth": sensor.bit_depth,
             "saturation_dn": sensor.saturation_dn,
-            "linear": True,
+            "linear": sensor.response == "linear",
             "gain_dn_per_e": sensor.gain_dn_per_e,
             "read_noise_e": sensor.read_noise_e,
             "offset_dn": sensor.offset_dn,
@@ -124,22 +123,31 @@ class SimulatedCamera:
             raise DeviceError(f"The {self.name} cannot expose for {exposure_s:g} s; choose {low:g} s to {high:g} s.")
         return round(exposure_s * 1e6) * 1e-6
 
-    def expose(self, t: float, exposure_s: float, label: str) -> NDArray[np.uint16]:
+    def rate(self, t: float) -> NDArray[np.float64]:
+        """Electrons per second of each pixel at `t` [s], without dark current; shape (height, width).
+
+        While nothing has moved, the last image serves again, as bright as the lamp is.
+        """
+        scene = self.world.scene(t)
+        key = (self.world.specimen_at(t), scene.frame.tobytes(), scene.lamp.tobytes(), scene.intensity > 0.0)
+        if self._rendered is None or self._rendered[0] != key:
+            unit = replace(scene, intensity=float(scene.intensity > 0.0))
+            image = radiance(unit, self.chip.eye, self.chip.rays, self.world.settings.sensor.lens_radius_mm)
+            self._rendered = (key, image)
+        return self.chip.electrons(self._rendered[1] * scene.intensity, self.world.colour(t))
+
+    def expose(self, t: float, exposure_s: float, label: str, gain: float = 1.0) -> NDArray[np.uint16]:
         """Counts of a frame whose exposure has its middle at `t` [s], shape (height, width) [DN]."""
-        sensor = self.world.settings.sensor
-        rate = self.world.radiance(t, self._eye, self._rays) * self._rate_per_radiance  # [e/s]
-        glare = self.world.truth.veiling_glare
-        if glare > 0.0:
-            rate = (1.0 - glare) * rate + glare * float(np.mean(rate))
         noise = generator(self.world.settings.seed, "frame", label)
-        # DN = K (Poisson(mean) + N(0, sigma_d)) + offset, rounded and cut to the converter's range
-        mean = np.minimum((rate + sensor.dark_current_e_s) * exposure_s, 1e9)
-        counts = noise.poisson(mean).astype(np.float64)
-        counts += sensor.read_noise_e * noise.standard_normal(len(counts))
-        counts = np.rint(sensor.gain_dn_per_e * counts + sensor.offset_dn)
+        image = self.chip.expose(self.rate(t), exposure_s, noise, gain)
         self.frames += 1
-        image: NDArray[np.uint16] = np.clip(counts, 0.0, sensor.saturation_dn).astype(np.uint16)
-        return image.reshape(sensor.height, sensor.width)
+        self.log.append({"label": label, "exposure_s": exposure_s, **self.world.state(t)})
+        before, self._previous = self._previous, image
+        spoil, self.spoil = self.spoil, None
+        if spoil is not None and before is not None:
+            torn = len(image) if spoil == "repeated" else len(image) // 2
+            image = np.concatenate((before[:torn], image[torn:]))
+        return image
 
     def finish(self, data: NDArray[np.uint16], exposure_s: float, label: str) -> Frame:
         """The frame, at the end of its exposure."""
@@ -150,7 +158,7 @@ class SimulatedCamera:
             gain=1.0,
             timestamp_s=self._clock.now(),
             bit_depth=sensor.bit_depth,
-            linear=True,
+            linear=sensor.response == "linear",
             saturation_dn=sensor.saturation_dn,
             label=label,
             metadata={"camera": self.name},

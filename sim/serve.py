@@ -19,6 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -36,6 +37,7 @@ from sim.dynamixel.servo import Servo
 from sim.lamp import ScpiLamp
 from sim.links import Device, Link, PtyLink, Pump, TcpLink
 from sim.port import attach, detach
+from sim.render import radiance
 from sim.scenario import Scenario
 from sim.settings import Settings, read_file
 from sim.world import COUNTS_PER_TURN, Truth, World
@@ -99,10 +101,17 @@ class Simulation:
                 initial_counts=joint.zero_counts,
                 backlash_counts=self.truth.backlash * COUNTS_PER_TURN / (2.0 * np.pi),
                 friction_counts=self.truth.friction_counts,
+                harmonics=self.truth.harmonics[name],
+                load=self.truth.loads[name],
+                supply_v=self.truth.supply_v,
                 seed=self.settings.seed,
             )
         self.bus = DynamixelBus(self.servos.values(), self._scenario.known_to_servos(ids))
-        self.lamp = ScpiLamp(drift_per_hour=self.truth.lamp_drift_per_hour, warm_up=self.truth.lamp_warm_up)
+        self.lamp = ScpiLamp(
+            drift_per_hour=self.truth.lamp_drift_per_hour,
+            warm_up=self.truth.lamp_warm_up,
+            channels=self.truth.lamp_channels,
+        )
         self.world = World(self.settings, self.truth, self.servos, self.lamp)
         self.camera = SimulatedCamera(self.world, self.clock, self._strike)
 
@@ -120,9 +129,11 @@ class Simulation:
 
     def warm_up(self) -> None:
         """Compile what the first frame needs, so that it comes as fast as the others."""
-        up = np.array([[0.0, 0.0, 1.0]])
-        self.truth.sample_brdf().evaluate(up, up)
-        self.truth.white_brdf().evaluate(up, up)
+        for specimen in ("white", "sample"):
+            self.world.mount(specimen)
+            lit = replace(self.world.scene(0.0), intensity=1.0)
+            rate = self.camera.chip.electrons(radiance(lit, self.camera.chip.eye, self.camera.chip.rays))
+        self.camera.chip.expose(rate, 1.0, np.random.default_rng(0))
 
     def close(self) -> None:
         """Detach from the ``sim://`` URLs."""
@@ -133,7 +144,7 @@ class Simulation:
         now = self.clock.now()
         for fault in self._scenario.due(label, self.camera.frames, now):
             if fault.kind == "lamp_out":
-                self.lamp.burnt_out = True
+                self.lamp.burnt_out_at = now
             elif fault.kind == "lamp_silent":
                 self.lamp.silent = True
             elif fault.kind == "camera_unplugged":

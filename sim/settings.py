@@ -52,7 +52,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A monochrome linear camera with a pinhole, looking down on the specimen from +z.
+    """A camera that looks down on the specimen from +z; as it comes, monochrome, linear, and with a pinhole.
 
     Attributes
     ----------
@@ -70,6 +70,25 @@ class Sensor:
         Electrons per second in a covered pixel.
     responsivity : float
         Electrons per second and unit of radiance [e s^-1 / (W m^-2 sr^-1)], on the optical axis.
+    lens_radius_mm : float
+        Of the aperture; 0 for a pinhole. It is sharp in the plane through the axes.
+    vignetting : float
+        Share of the light that is missing in the corners, beyond cos^4; grows with the square of the distance.
+    veiling_glare : float
+        Share of the mean of an image that is spread over all of it.
+    psf_sigma_px : float
+        Standard deviation of the Gaussian point spread [pixels].
+    prnu : float
+        Relative standard deviation of the pixels' gains.
+    cfa : str
+        Colours of the pixels (0, 0), (0, 1), (1, 0), (1, 1), e.g. ``"RGGB"``; empty for a monochrome sensor.
+    cfa_response : tuple of float
+        Of red, green and blue pixels to white light, relative to a monochrome one.
+    response : {"linear", "gamma"}
+    gamma : float
+        With ``"gamma"``, counts go with the signal to the power 1 / gamma.
+    frame_interval_s : float
+        Of the stream that a driver for live cameras sees.
     """
 
     distance_mm: float = 600.0
@@ -82,6 +101,24 @@ class Sensor:
     bit_depth: int = 12
     dark_current_e_s: float = 20.0
     responsivity: float = 3.25e5
+    lens_radius_mm: float = 0.0
+    vignetting: float = 0.0
+    veiling_glare: float = 0.0
+    psf_sigma_px: float = 0.0
+    prnu: float = 0.0
+    cfa: str = ""
+    cfa_response: tuple[float, float, float] = (0.6, 1.0, 0.5)
+    response: str = "linear"
+    gamma: float = 2.2
+    frame_interval_s: float = 1.0 / 30.0
+
+    def hidden(self) -> dict[str, Any]:
+        """What no data sheet tells, ready for JSON."""
+        names = (
+            "dark_current_e_s", "responsivity", "lens_radius_mm", "vignetting", "psf_sigma_px", "prnu", "cfa",
+            "cfa_response", "response", "gamma",
+        )  # fmt: skip
+        return {name: list(v) if isinstance(v := getattr(self, name), tuple) else v for name in names}
 
     @property
     def saturation_dn(self) -> int:
@@ -104,6 +141,10 @@ class Settings:
         Radiant intensity at full output [W/sr]; the same in every direction.
     beta, u_beta : float
         Radiance factor that the white's certificate states, and its standard uncertainty.
+    white_deg : tuple of float
+        Arm, pan and tilt of the geometry that the white's certificate is for [degrees].
+    baud : int
+        Of the bus [bit/s].
     speed : float
         Rig seconds per wall second, where the wall's clock is used.
     seed : int
@@ -118,6 +159,8 @@ class Settings:
     lamp_intensity: float = 1.0
     beta: float = 0.99
     u_beta: float = 0.005
+    white_deg: tuple[float, float, float] = (30.0, 15.0, 0.0)
+    baud: int = 1_000_000
     speed: float = 1.0
     seed: int = 1
     truth: Mapping[str, Any] = field(default_factory=dict)
@@ -159,6 +202,13 @@ class Settings:
         camera, lamp = root.table("camera"), root.table("lamp")
         white, sim = root.table("white"), root.table("sim")
         truth = sim.table("truth")
+        cfa = truth.text("cfa", "")
+        if cfa and not (len(cfa) == 4 and set(cfa) <= set("RGB")):
+            raise ConfigurationError(f"[sim.truth] cfa = {cfa!r} is no pattern of four colours; write for example RGGB.")
+        response = truth.text("response", "linear")
+        if response not in ("linear", "gamma"):
+            raise ConfigurationError(f"[sim.truth] response = {response!r} is not known; write linear or gamma.")
+        red, green, blue = truth.numbers("cfa_response", (0.6, 1.0, 0.5), 0.0, 10.0)
         sensor = Sensor(
             camera.number("distance_mm", 600.0, 10.0, 1e5),
             truth.integer("width", 160, 8, 4096),
@@ -170,6 +220,16 @@ class Settings:
             camera.integer("bit_depth", 12, 8, 16),
             truth.number("dark_current_e_s", 20.0, 0.0, 1e6),
             truth.number("responsivity", 3.25e5, 0.0, 1e12),
+            truth.number("lens_radius_mm", 0.0, 0.0, 100.0),
+            truth.number("vignetting", 0.0, 0.0, 1.0),
+            truth.number("veiling_glare", 0.0, 0.0, 0.9),
+            truth.number("psf_sigma_px", 0.0, 0.0, 100.0),
+            truth.number("prnu", 0.0, 0.0, 0.5),
+            cfa,
+            (red, green, blue),
+            response,
+            truth.number("gamma", 2.2, 1.0, 5.0),
+            truth.number("frame_interval_s", 1.0 / 30.0, 1e-4, 60.0),
         )
         return cls(
             axes,
@@ -178,6 +238,12 @@ class Settings:
             truth.number("lamp_intensity", 1.0, 0.0, 1e6),
             white.number("beta", 0.99, 1e-6, 10.0),
             white.number("u_beta", 0.005, 0.0, 1.0),
+            (
+                white.number("arm_deg", 30.0, -180.0, 180.0),
+                white.number("pan_deg", 15.0, -180.0, 180.0),
+                white.number("tilt_deg", 0.0, -180.0, 180.0),
+            ),
+            root.table("bus").integer("baud", 1_000_000, 9_600, 4_500_000),
             sim.number("speed", 1.0, 1e-3, 1e4),
             sim.integer("seed", 1, 0, 2**63 - 1),
             truth.values,
@@ -240,6 +306,13 @@ class Table:
             within = f"{lower:g} to {upper:g}"
             raise ConfigurationError(f"[{self.place}] {key} = {value:g} is outside {within}; choose one inside.")
         return float(value)
+
+    def numbers(self, key: str, default: tuple[float, ...], lower: float, upper: float) -> tuple[float, ...]:
+        """As many finite numbers as `default` has, each within [lower, upper]."""
+        value = self.values.get(key, default)
+        if not isinstance(value, list | tuple) or len(value) != len(default):
+            raise ConfigurationError(f"[{self.place}] {key} must be a list of {len(default)} numbers, and is {value!r}.")
+        return tuple(Table({key: one}, self.place).number(key, 0.0, lower, upper) for one in value)
 
     def integer(self, key: str, default: int, lower: int, upper: int) -> int:
         """A whole number within [lower, upper]."""

@@ -2,23 +2,24 @@ r"""The truth behind the simulated bench: what the joints, the specimen and the 
 
 A measurement has to find this out again, so nothing here is shared with the code that will: poses are composed from
 rotation matrices of its own. The arm carries the lamp in the x-z plane, the camera looks down from +z, the specimen is
-a flat disk through the origin, turned by tilt about x and then by pan about y:
+a flat disk through the origin, or another shape about it, turned by tilt about x and then by pan about y:
 
 .. math:: \ell = R_y(\gamma)\,\hat z, \qquad (t, b, n) = R_y(\beta)\,R_x(\tau).
 
 The true angle of a joint is that of the link behind the play, plus the error of the zero. The zero of an axis was set
 with the approach that the axis always takes, so half of the play is part of its error and not added to it.
 
-Not modelled: the arm's shadow and the arm in front of the camera (a plan has to stay clear of them), light between
-specimen and bench, polarisation, colour, the lamp's size.
+What light does between lamp, specimen and lens is in `sim.render`. Not modelled: the arm's shadow and the arm in front of
+the camera (a plan has to stay clear of them), light between specimen and bench, polarisation.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,19 +28,26 @@ from numpy.typing import NDArray
 from gonio import brdf
 from gonio.brdf import BRDF, Term, term_names
 from gonio.errors import ConfigurationError
+from sim import board
+from sim.dynamixel.load import Load
+from sim.lamp import Channel
+from sim.render import SHAPES, Scene, radiance
 from sim.settings import AXES, Settings, Table
 
 Array = NDArray[np.float64]
 
 COUNTS_PER_TURN = 4096
-SPECIMENS = ("sample", "white", "trap")
+SPECIMENS = ("sample", "white", "trap", "board")
 
 DEFAULT_MODEL = "lambertian+ggx"
 DEFAULT_PARAMETERS = {"lambertian.albedo": 0.5, "ggx.k_s": 1.0, "ggx.alpha": 0.2, "ggx.f_0": 0.06}
 _KEYS = (
     "model", "parameters", "errors", "zero_deg", "white_beta", "lamp_drift_per_hour", "lamp_warm_up", "veiling_glare",
     "backlash_deg", "friction_counts", "specimen_radius_mm", "width", "height", "pixel_mm", "dark_current_e_s",
-    "responsivity", "lamp_intensity",
+    "responsivity", "lamp_intensity", "lamp_radius_mm", "lamp_channels", "lens_radius_mm", "vignetting", "psf_sigma_px",
+    "prnu", "cfa", "cfa_response", "response", "gamma", "frame_interval_s", "shape", "half_length_mm", "board_squares",
+    "board_square_mm", "board_dark", "white_model", "white_parameters", "encoder_harmonics_deg", "load_nm", "hanging_deg",
+    "supply_v",
 )  # fmt: skip
 
 
@@ -56,6 +64,10 @@ class Light(Protocol):
 
     def relative_output(self, t: float) -> float:
         """Radiant output at rig time `t` [s], 1 when new, warm and at full level."""
+        ...
+
+    def colour(self, t: float) -> tuple[float, float, float]:
+        """How red, green and blue it is; white is 1, 1, 1."""
         ...
 
 
@@ -96,6 +108,30 @@ class Truth:
     veiling_glare : float
         Share of the mean of an image that is spread over all of it.
     specimen_radius_mm : float
+        Of a disk, a sphere or a cylinder.
+    shape : str
+        Of the sample, as in `sim.render.Scene`: flat, sphere or cylinder.
+    half_length_mm : float
+        Of a cylinder.
+    lamp_radius_mm : float
+        Of the lamp's globe; 0 for a point.
+    lamp_channels : tuple of Channel
+        The head's LEDs.
+    white_model : str
+        BRDF of the white, scaled so that its radiance factor at the certificate's geometry is `white_beta`.
+    white_parameters : mapping of str to float
+    board_squares : tuple of int
+        Columns and rows of the ChArUco board.
+    board_square_mm, board_dark : float
+        Side of its squares; reflectance of its ink relative to its paper, which is a Lambertian white.
+    harmonics : mapping of str to tuple
+        By axis: (n, amplitude [counts], phase [rad]) of the encoder's errors.
+    loads : mapping of str to Load
+        By axis: the weight of what it carries.
+    supply_v : float or None
+        Of the servos; None for the models' nominal voltages.
+    hidden : mapping
+        Of the sensor.
     """
 
     seed: int
@@ -109,6 +145,19 @@ class Truth:
     lamp_warm_up: float
     veiling_glare: float
     specimen_radius_mm: float
+    shape: str = "flat"
+    half_length_mm: float = 50.0
+    lamp_radius_mm: float = 0.0
+    lamp_channels: tuple[Channel, ...] = (Channel(),)
+    white_model: str = "lambertian"
+    white_parameters: Mapping[str, float] = field(default_factory=dict)
+    board_squares: tuple[int, int] = (8, 6)
+    board_square_mm: float = 4.0
+    board_dark: float = 0.04
+    harmonics: Mapping[str, tuple[tuple[int, float, float], ...]] = field(default_factory=dict)
+    loads: Mapping[str, Load] = field(default_factory=dict)
+    supply_v: float | None = None
+    hidden: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def draw(cls, settings: Settings) -> Truth:
@@ -137,25 +186,36 @@ class Truth:
             degrees = zeros.number(name, math.degrees(drawn) if errors else 0.0, -360.0, 360.0)
             zero_errors[name] = math.radians(degrees)
         drawn = settings.beta * (1.0 + settings.u_beta * float(generator(settings.seed, "white").standard_normal()))
-        friction = given.values.get("friction_counts", (0.2, 3.0))
-        if not (
-            isinstance(friction, list | tuple)
-            and len(friction) == 2
-            and all(isinstance(x, int | float) and 0 <= x <= 100 for x in friction)
-        ):
-            raise ConfigurationError(f"[sim.truth] friction_counts must be two numbers from 0 to 100, and is {friction!r}.")
+        friction = given.numbers("friction_counts", (0.2, 3.0), 0.0, 100.0)
+        shape = given.text("shape", "flat")
+        if shape not in SHAPES[:3]:
+            raise ConfigurationError(f"[sim.truth] shape = {shape!r} is not known; choose one of {', '.join(SHAPES[:3])}.")
+        columns, rows = given.numbers("board_squares", (8, 6), 3, 50)
         return cls(
             seed=settings.seed,
             model=model,
             parameters=_parameters(given, model, names),
             zero_errors=zero_errors,
             backlash=math.radians(given.number("backlash_deg", 0.25, 0.0, 10.0)),
-            friction_counts=(float(friction[0]), float(friction[1])),
+            friction_counts=(friction[0], friction[1]),
             white_beta=given.number("white_beta", drawn if errors else settings.beta, 0.0, 10.0),
             lamp_drift_per_hour=given.number("lamp_drift_per_hour", 0.01, -1.0, 1.0),
             lamp_warm_up=given.number("lamp_warm_up", 0.0, 0.0, 1.0),
             veiling_glare=given.number("veiling_glare", 0.0, 0.0, 0.9),
             specimen_radius_mm=given.number("specimen_radius_mm", 25.0, 1e-3, 1e5),
+            shape=shape,
+            half_length_mm=given.number("half_length_mm", 50.0, 1e-3, 1e5),
+            lamp_radius_mm=given.number("lamp_radius_mm", 0.0, 0.0, 0.3 * settings.lamp_distance_mm),
+            lamp_channels=_channels(given),
+            white_model=given.text("white_model", "lambertian"),
+            white_parameters={str(k): float(v) for k, v in given.table("white_parameters").values.items()},
+            board_squares=(int(columns), int(rows)),
+            board_square_mm=given.number("board_square_mm", 4.0, 1e-3, 1e5),
+            board_dark=given.number("board_dark", 0.04, 0.0, 1.0),
+            harmonics={name: _harmonics(given, name) for name in AXES},
+            loads=_loads(given, settings),
+            supply_v=given.number("supply_v", 0.0, 0.0, 60.0) or None,
+            hidden=settings.sensor.hidden(),
         )
 
     def sample_brdf(self) -> BRDF:
@@ -167,9 +227,15 @@ class Truth:
             terms.append(Term(model, model.values(values)))
         return BRDF(terms)
 
-    def white_brdf(self) -> BRDF:
-        """The white's BRDF, f_r = beta / pi."""
-        return self.white_beta * brdf.make("lambertian", albedo=1.0)
+    def white_brdf(self, white_deg: tuple[float, float, float] = (30.0, 15.0, 0.0)) -> BRDF:
+        """The white's BRDF: f_r = beta / pi at the certificate's geometry (arm, pan and tilt [degrees])."""
+        if self.white_model == "lambertian":
+            return self.white_beta * brdf.make("lambertian", albedo=1.0)
+        plain = brdf.make(self.white_model, **self.white_parameters)
+        arm, pan, tilt = np.radians(white_deg)
+        frame = rotation_y(float(pan)) @ rotation_x(float(tilt))
+        to_lamp, to_eye = rotation_y(float(arm))[:, 2] @ frame, frame[2]
+        return self.white_beta / (math.pi * float(plain.evaluate(to_lamp, to_eye))) * plain
 
     def as_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON; angles in degrees under names that say so."""
@@ -185,7 +251,65 @@ class Truth:
             "lamp_warm_up": self.lamp_warm_up,
             "veiling_glare": self.veiling_glare,
             "specimen_radius_mm": self.specimen_radius_mm,
+            "shape": self.shape,
+            "half_length_mm": self.half_length_mm,
+            "lamp_radius_mm": self.lamp_radius_mm,
+            "lamp_channels": [{"share": c.share, "colour": list(c.colour)} for c in self.lamp_channels],
+            "white_model": self.white_model,
+            "white_parameters": dict(self.white_parameters),
+            "board_squares": list(self.board_squares),
+            "board_square_mm": self.board_square_mm,
+            "board_dark": self.board_dark,
+            "encoder_harmonics_deg": {
+                name: [[n, a * 360.0 / COUNTS_PER_TURN, math.degrees(phase)] for n, a, phase in waves]
+                for name, waves in self.harmonics.items()
+            },
+            "load_nm": {name: load.torque_nm for name, load in self.loads.items()},
+            "supply_v": self.supply_v,
+            "sensor": dict(self.hidden),
         }
+
+
+def _channels(given: Table) -> tuple[Channel, ...]:
+    """``lamp_channels = [{share = 0.5, colour = [3, 0, 0]}, ...]``."""
+    entries = given.values.get("lamp_channels", [{}])
+    if not isinstance(entries, list | tuple) or not entries:
+        raise ConfigurationError("[sim.truth] lamp_channels must be a list of tables with share and colour.")
+    channels = []
+    for k, entry in enumerate(entries, start=1):
+        table = Table({"channel": entry}, "sim.truth").table("channel")
+        table = Table(table.values, f"sim.truth: lamp_channels {k}")
+        table.only(("share", "colour"))
+        red, green, blue = table.numbers("colour", (1.0, 1.0, 1.0), 0.0, 100.0)
+        channels.append(Channel(table.number("share", 1.0 / len(entries), 0.0, 1.0), (red, green, blue)))
+    return tuple(channels)
+
+
+def _harmonics(given: Table, axis: str) -> tuple[tuple[int, float, float], ...]:
+    """``encoder_harmonics_deg.pan = [[n, amplitude, phase], ...]``, in degrees; as (n, counts, rad)."""
+    table = given.table("encoder_harmonics_deg")
+    table.only(AXES)
+    waves = table.values.get(axis, ())
+    if not isinstance(waves, list | tuple):
+        raise ConfigurationError(f"[{table.place}] {axis} must be a list of waves [n, amplitude, phase].")
+    found = []
+    for wave in waves:
+        n, amplitude, phase = Table({axis: wave}, table.place).numbers(axis, (1.0, 0.0, 0.0), -360.0, 360.0)
+        found.append((int(n), amplitude * COUNTS_PER_TURN / 360.0, math.radians(phase)))
+    return tuple(found)
+
+
+def _loads(given: Table, settings: Settings) -> dict[str, Load]:
+    """``load_nm.tilt`` and ``hanging_deg.tilt``: torque of the weight, and the joint angle at which it hangs."""
+    torques, angles = given.table("load_nm"), given.table("hanging_deg")
+    torques.only(AXES)
+    angles.only(AXES)
+    loads = {}
+    for name in AXES:
+        joint = settings.axes[name]
+        hanging = joint.direction * angles.number(name, 180.0, -360.0, 360.0) * COUNTS_PER_TURN / 360.0
+        loads[name] = Load(torques.number(name, 0.0, 0.0, 100.0), joint.zero_counts + hanging)
+    return loads
 
 
 def _parameters(given: Table, model: str, names: tuple[str, ...]) -> dict[str, float]:
@@ -232,27 +356,30 @@ class World:
     links : mapping of str to Link
         By axis.
     lamp : Light
-
-    Attributes
-    ----------
-    specimen : str
-        What lies on the stage: ``"sample"``, ``"white"`` or ``"trap"``, which returns no light.
     """
 
     def __init__(self, settings: Settings, truth: Truth, links: Mapping[str, Link], lamp: Light) -> None:
         self.settings = settings
         self.truth = truth
-        self.specimen = "sample"
+        self._specimens: deque[tuple[float, str]] = deque([(-math.inf, "sample")], 64)
         self._links = dict(links)
         self._lamp = lamp
-        self._brdfs = {"sample": truth.sample_brdf(), "white": truth.white_brdf()}
+        white = truth.white_brdf(settings.white_deg)
+        paper = truth.white_beta * brdf.make("lambertian", albedo=1.0)
+        self._brdfs = {"sample": truth.sample_brdf(), "white": white, "trap": white, "board": paper}
+        self._board: Array | None = None
         half = {"up": 0.5, "down": -0.5, "any": 0.0}
         self._offsets = {
             name: truth.zero_errors[name] + half[settings.axes[name].approach] * truth.backlash for name in AXES
         }
 
-    def mount(self, specimen: str) -> None:
-        """Put ``"sample"``, ``"white"`` or ``"trap"`` on the stage.
+    @property
+    def specimen(self) -> str:
+        """What lies on the stage: ``"sample"``, ``"white"``, ``"board"``, or ``"trap"``, which returns no light."""
+        return self._specimens[-1][1]
+
+    def mount(self, specimen: str, t: float = -math.inf) -> None:
+        """Put ``"sample"``, ``"white"``, ``"board"`` or ``"trap"`` on the stage, at `t` [s].
 
         Raises
         ------
@@ -261,7 +388,11 @@ class World:
         """
         if specimen not in SPECIMENS:
             raise ConfigurationError(f"There is no specimen {specimen!r} to mount; there are {', '.join(SPECIMENS)}.")
-        self.specimen = specimen
+        self._specimens.append((t, specimen))
+
+    def specimen_at(self, t: float) -> str:
+        """What lay on the stage at `t` [s]."""
+        return next((specimen for since, specimen in reversed(self._specimens) if since <= t), self._specimens[0][1])
 
     def angles(self, t: float) -> dict[str, float]:
         """True joint angles at `t` [s], by axis [rad]."""
@@ -272,6 +403,32 @@ class World:
             true[name] = joint.direction * counts * (2.0 * math.pi / COUNTS_PER_TURN) + self._offsets[name]
         return true
 
+    def scene(self, t: float) -> Scene:
+        """Specimen and lamp at `t` [s]."""
+        truth, settings = self.truth, self.settings
+        angles = self.angles(t)
+        frame = rotation_y(angles["pan"]) @ rotation_x(angles["tilt"])  # columns t, b, n
+        lamp = rotation_y(angles["arm"])[:, 2] * settings.lamp_distance_mm
+        intensity = settings.lamp_intensity * self._lamp.relative_output(t)
+        specimen = self.specimen_at(t)
+        shape, radius, half_length, texture = "flat", truth.specimen_radius_mm, truth.half_length_mm, None
+        if specimen == "sample":
+            shape = truth.shape
+        elif specimen == "trap":
+            intensity = 0.0
+        elif specimen == "board":
+            columns, rows = truth.board_squares
+            shape = "board"
+            radius, half_length = 0.5 * columns * truth.board_square_mm, 0.5 * rows * truth.board_square_mm
+            if self._board is None:
+                self._board = board.texture(
+                    columns, rows, truth.board_dark, truth.board_square_mm, settings.sensor.pixel_mm
+                )
+            texture = self._board
+        return Scene(
+            self._brdfs[specimen], frame, lamp, intensity, truth.lamp_radius_mm, shape, radius, half_length, texture
+        )
+
     def radiance(self, t: float, eye: Array, rays: Array) -> Array:
         """Radiance that reaches a camera.
 
@@ -280,44 +437,26 @@ class World:
         t : float
             Rig time [s].
         eye : ndarray, shape (3,)
-            Where the camera is [mm].
+            Where the middle of the camera's lens is [mm].
         rays : ndarray, shape (n, 3)
             Unit vectors into which it looks.
 
         Returns
         -------
         ndarray, shape (n,)
-            L_r [W m^-2 sr^-1]; 0 beside the specimen, behind it and where no light falls on it.
-
-        Notes
-        -----
-        For a lamp that is a point, the integral of f_r over the incident light is one evaluation per ray,
-        L_r = f_r (I / d^2) cos theta_i, with the directions and the distance d of the place where the ray meets the disk.
+            L_r [W m^-2 sr^-1], its mean over the lens; 0 beside the specimen, behind it and where no light falls on it.
         """
-        out = np.zeros(len(rays))
-        intensity = self.settings.lamp_intensity * self._lamp.relative_output(t)
-        if self.specimen == "trap" or intensity == 0.0:
-            return out
-        angles = self.angles(t)
-        frame = rotation_y(angles["pan"]) @ rotation_x(angles["tilt"])  # columns t, b, n
-        lamp = rotation_y(angles["arm"])[:, 2] * self.settings.lamp_distance_mm
-        # Everything in the specimen's frame, where its plane is z = 0.
-        eye_local, lamp_local = eye @ frame, lamp @ frame
-        if eye_local[2] <= 0.0 or lamp_local[2] <= 0.0:
-            return out
-        rays_local = rays @ frame  # (n, 3)
-        down = rays_local[:, 2] < 0.0
-        reach = np.divide(-eye_local[2], rays_local[:, 2], out=np.zeros(len(rays)), where=down)
-        x = eye_local[0] + reach * rays_local[:, 0]
-        y = eye_local[1] + reach * rays_local[:, 1]
-        hit = np.flatnonzero(down & (x * x + y * y <= self.truth.specimen_radius_mm**2))
-        to_lamp = np.empty((len(hit), 3))
-        to_lamp[:, 0] = lamp_local[0] - x[hit]
-        to_lamp[:, 1] = lamp_local[1] - y[hit]
-        to_lamp[:, 2] = lamp_local[2]
-        d2 = np.einsum("ij,ij->i", to_lamp, to_lamp)  # [mm^2]
-        omega_i = to_lamp / np.sqrt(d2)[:, None]
-        f_r = self._brdfs[self.specimen].evaluate(omega_i, -rays_local[hit])
-        # E = I cos theta_i / d^2, d in metres
-        out[hit] = f_r * (intensity * 1e6) * omega_i[:, 2] / d2
-        return out
+        return radiance(self.scene(t), eye, rays, self.settings.sensor.lens_radius_mm)
+
+    def colour(self, t: float) -> tuple[float, float, float]:
+        """How red, green and blue the lamp is at `t`."""
+        return self._lamp.colour(t)
+
+    def state(self, t: float) -> dict[str, Any]:
+        """What is true at `t` [s], ready for JSON; angles in degrees."""
+        return {
+            "t_s": t,
+            "specimen": self.specimen_at(t),
+            "angles_deg": {name: math.degrees(angle) for name, angle in self.angles(t).items()},
+            "lamp": self._lamp.relative_output(t),
+        }

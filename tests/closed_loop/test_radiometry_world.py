@@ -42,6 +42,9 @@ class Lamp:
     def relative_output(self, t):
         return (1 - 0.02 * t / 3600) if self.on else 0.0
 
+    def colour(self, t):
+        return (1.0, 1.0, 1.0)
+
 
 # beta is stated to 0.5 %, the zeros to 0.1 degree; `white_beta` is 1.5 % below the certificate's
 HIDDEN = {"white_beta": 0.975, "zero_errors": {"arm": 0.008, "pan": -0.007, "tilt": 0.009}}

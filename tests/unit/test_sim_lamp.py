@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from sim.lamp import ScpiLamp
+from sim.lamp import Channel, ScpiLamp
 
 
 def _say(lamp: ScpiLamp, text: str, t: float = 0.0) -> str:
@@ -82,7 +82,8 @@ def test_light_warms_up_and_drifts() -> None:
     assert lamp.relative_output(100.0 + 3600.0) == pytest.approx(0.5 * 0.98)
     _say(lamp, "OUTP ON\n", t=200.0)  # already on: no second warm-up
     assert lamp.relative_output(100.0 + 3600.0) == pytest.approx(0.5 * 0.98)
-    lamp.burnt_out = True
+    lamp.burnt_out_at = 250.0
+    assert lamp.relative_output(200.0) > 0.0
     assert lamp.relative_output(300.0) == 0.0
 
 
@@ -90,3 +91,42 @@ def test_a_silent_lamp_says_nothing() -> None:
     lamp = ScpiLamp()
     lamp.silent = True
     assert _say(lamp, "*IDN?\n") == ""
+
+
+def test_a_head_with_several_leds() -> None:
+    """Rationale: heads with several LEDs have one output each; a suffix or the selected instrument says which."""
+    lamp = ScpiLamp(channels=(Channel(0.5, (3.0, 0.0, 0.0)), Channel(0.25, (0.0, 3.0, 0.0)), Channel(0.25, (0.0, 0.0, 3.0))))
+    assert _say(lamp, "INST:CAT?\n") == '"CH1","CH2","CH3"\n'
+    assert _say(lamp, "INST?;:INST:NSEL?\n") == "CH1;1\n"
+    _say(lamp, "OUTP ON;:OUTP3 ON;:SOUR3:LEV 0.5\n")
+    assert _say(lamp, "OUTP1?;:OUTP2?;:OUTP3:STAT?;:SOUR3:LEV?\n") == "1;0;1;0.5\n"
+    assert lamp.relative_output(1.0) == pytest.approx(0.5 + 0.125)
+    assert lamp.colour(1.0) == pytest.approx((3 * 0.8, 0.0, 3 * 0.2))
+    _say(lamp, "INST CH2\nOUTP 1\n")
+    assert _say(lamp, "INST:SEL?;:OUTP2?\n") == "CH2;1\n"
+    _say(lamp, "INSTrument:NSELect 3;:OUTPut:STATe OFF\n")
+    assert lamp.relative_output(1.0) == pytest.approx(0.75)
+    for text, error in (("OUTP4 ON", -114), ("INST CH9", -224), ("INST:NSEL x", -104), ("INST:NSEL", -109)):
+        _say(lamp, f"{text}\n")
+        assert _say(lamp, "SYST:ERR?\n").startswith(f"{error},")
+
+
+def test_status_of_ieee_488() -> None:
+    """Event status: operation complete 1, device 8, execution 16, command error 32; reading it clears it."""
+    lamp = ScpiLamp()
+    assert _say(lamp, "*OPC;*ESR?\n*ESR?\n*TST?\n*WAI\n") == "1\n0\n0\n"
+    _say(lamp, "*ESE 48;*SRE 36\nNOPE\nSOUR:LEV 3\n")
+    assert _say(lamp, "*ESE?;*SRE?;*STB?\n") == "48;36;100\n"
+    assert _say(lamp, "SYST:ERR:COUN?;*ESR?;*STB?\n") == "2;48;68\n"
+    _say(lamp, "*CLS\n")
+    assert _say(lamp, "*STB?;*ESR?\n") == "0;0\n"
+    _say(lamp, "*ESE 256\n")
+    assert _say(lamp, "SYST:ERR?\n").startswith("-222,")
+
+
+def test_past_light_is_remembered() -> None:
+    lamp = ScpiLamp()
+    _say(lamp, "OUTP ON\n", t=1.0)
+    _say(lamp, "SOUR:LEV 0.5\n", t=2.0)
+    _say(lamp, "OUTP OFF\n", t=3.0)
+    assert [lamp.relative_output(t) for t in (0.5, 1.5, 2.5, 3.5)] == [0.0, 1.0, 0.5, 0.0]

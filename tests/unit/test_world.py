@@ -198,7 +198,7 @@ def test_parameters_may_be_written_in_three_ways(written):
         ({"model": "lambertian", "parameters": {"ggx.alpha": 0.1}}, ConfigurationError, "no term of the model"),
         ({"errors": 1}, ConfigurationError, "true or false"),
         ({"zero_deg": {"spin": 1.0}}, ConfigurationError, "known are arm, pan, tilt"),
-        ({"friction_counts": [0.2]}, ConfigurationError, "two numbers"),
+        ({"friction_counts": [0.2]}, ConfigurationError, "2 numbers"),
         ({"veiling_glare": float("nan")}, ConfigurationError, "veiling_glare = nan is outside"),
     ],
 )

@@ -1,0 +1,140 @@
+"""The simulated camera as a web camera: motion JPEG over HTTP, for real clients with their stale frames.
+
+One frame every `Sensor.frame_interval_s` of rig time, as ``multipart/x-mixed-replace``; what a client has not read waits in
+the sockets' buffers, and a frame that does not fit is dropped. Eight bits, compressed: nothing for radiometry.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Sequence
+
+from gonio.errors import DeviceError
+from sim.camera import SimulatedCamera
+from sim.clock import ScaledClock
+from sim.links import Link
+
+_BOUNDARY = "frame"
+_HEAD = f"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary={_BOUNDARY}\r\n\r\n"
+_LONGEST_REQUEST = 16_384
+
+
+class MjpegLink:
+    """A listening socket on 127.0.0.1; satisfies `sim.links.Link`.
+
+    Parameters
+    ----------
+    camera : SimulatedCamera
+    clock : ScaledClock
+    exposure_s : float, optional
+        Of every frame [s].
+    port : int, optional
+        0 for any free one.
+
+    Attributes
+    ----------
+    url : str
+    frames : int
+        How many were handed to clients.
+    """
+
+    def __init__(self, camera: SimulatedCamera, clock: ScaledClock, exposure_s: float = 0.016, port: int = 0) -> None:
+        self.camera = camera
+        self.clock = clock
+        self.exposure_s = exposure_s
+        self.frames = 0
+        self.closed = False
+        try:
+            self._listener = socket.create_server(("127.0.0.1", port))
+        except OSError as error:
+            raise DeviceError(f"Cannot listen on 127.0.0.1:{port} ({error.strerror}); choose another port.") from error
+        self._listener.setblocking(False)
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/"
+
+    def fileno(self) -> int:
+        return self._listener.fileno()
+
+    def on_readable(self) -> Sequence[Link]:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return ()
+        client.setblocking(False)
+        return (_Viewer(self, client),)
+
+    def due(self) -> float | None:
+        return None
+
+    def on_due(self) -> None:
+        return
+
+    def close(self) -> None:
+        self.closed = True
+        self._listener.close()
+
+    def picture(self) -> bytes:
+        """A frame of now, as one part of the stream."""
+        import cv2
+
+        label = f"mjpeg {self.frames}"
+        counts = self.camera.expose(self.clock.now(), self.exposure_s, label)
+        shift = max(self.camera.world.settings.sensor.bit_depth - 8, 0)
+        jpeg = cv2.imencode(".jpg", (counts >> shift).astype("uint8"))[1].tobytes()
+        self.frames += 1
+        head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+        return head.encode() + jpeg + b"\r\n"
+
+
+class _Viewer:
+    """One client."""
+
+    def __init__(self, link: MjpegLink, client: socket.socket) -> None:
+        self._link = link
+        self._socket = client
+        self._request = b""
+        self._unsent = memoryview(b"")
+        self._next: float | None = None  # when the next frame leaves; None until it was asked for
+        self.closed = False
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def on_readable(self) -> Sequence[Link]:
+        try:
+            data = self._socket.recv(4096)
+        except BlockingIOError:
+            return ()
+        except OSError:
+            data = b""
+        self._request += data
+        if not data or len(self._request) > _LONGEST_REQUEST:
+            self.closed = True
+        elif self._next is None and b"\r\n\r\n" in self._request:
+            self._unsent = memoryview(_HEAD.encode())
+            self._next = time.monotonic()
+        return ()
+
+    def due(self) -> float | None:
+        return self._next
+
+    def on_due(self) -> None:
+        interval = self._link.camera.world.settings.sensor.frame_interval_s / self._link.clock.speed
+        self._next = max((self._next or 0.0) + interval, time.monotonic())
+        self._flush()
+        if not len(self._unsent) and not self.closed:  # else this frame is dropped
+            self._unsent = memoryview(self._link.picture())
+            self._flush()
+
+    def close(self) -> None:
+        self.closed = True
+        self._socket.close()
+
+    def _flush(self) -> None:
+        try:
+            while len(self._unsent):
+                self._unsent = self._unsent[self._socket.send(self._unsent) :]
+        except BlockingIOError:
+            return
+        except OSError:
+            self.closed = True
