@@ -320,6 +320,8 @@ class SocketCamera:
         DeviceError
             If the camera refuses, does not answer in time, or is gone.
         """
+        if not math.isfinite(exposure_s):
+            raise DeviceError(f"The {self.name} cannot expose for {exposure_s} s; give a number.")
         request = {"do": "capture", "exposure_s": float(exposure_s), "label": label}
         frame = decode_frame(*self._ask(request, exposure_s / self._speed))
         if frame.label != label:

@@ -50,6 +50,8 @@ class ScaledClock:
     ----------
     speed : float, optional
         Rig seconds per wall second.
+    start_ns : int, optional
+        When it showed 0, on the system's monotonic clock [ns], which all processes share; now by default.
 
     Raises
     ------
@@ -57,15 +59,15 @@ class ScaledClock:
         If `speed` is not positive.
     """
 
-    def __init__(self, speed: float = 1.0) -> None:
+    def __init__(self, speed: float = 1.0, start_ns: int | None = None) -> None:
         if not speed > 0.0:
             raise ParameterError(f"The simulator's speed is {speed}; it must be above 0 rig seconds per wall second.")
         self.speed = float(speed)
-        self._start_ns = time.monotonic_ns()
+        self.start_ns = time.monotonic_ns() if start_ns is None else start_ns
 
     def now(self) -> float:
-        """Rig seconds since this clock was made [s]."""
-        return (time.monotonic_ns() - self._start_ns) * 1e-9 * self.speed
+        """Rig seconds since it showed 0 [s]."""
+        return (time.monotonic_ns() - self.start_ns) * 1e-9 * self.speed
 
     def sleep(self, seconds: float) -> None:
         """Wait `seconds` of rig time [s]."""

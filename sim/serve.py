@@ -342,7 +342,8 @@ def serve(argv: Sequence[str] | None = None, *, announce: Callable[[str], None] 
         Options; those of the process by default.
     announce : callable, optional
         Gets the line ``ready {json}``; standard output by default. The JSON object has ``bus`` and ``lamp`` (what
-        pyserial opens), ``camera`` (host:port), ``tcp`` (the bus's URL, or null), ``speed``, ``seed``, ``pid``.
+        pyserial opens), ``camera`` (host:port), ``tcp`` (the bus's URL, or null), ``speed``, ``start_ns`` (rig time 0 on the
+        system's monotonic clock), ``seed``, ``pid``.
 
     Returns
     -------
@@ -386,6 +387,7 @@ def serve(argv: Sequence[str] | None = None, *, announce: Callable[[str], None] 
             "camera": f"{camera.address[0]}:{camera.address[1]}",
             "tcp": tcp,
             "speed": simulated.speed,
+            "start_ns": simulated.start_ns,
             "seed": simulation.settings.seed,
             "pid": os.getpid(),
         }

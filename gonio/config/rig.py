@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ AXES = ("arm", "pan", "tilt")
 COUNTS_PER_TURN = 4096
 SIMULATED = "sim"
 BACKENDS = ("v4l2", "dshow", "msmf", "avfoundation", "ffmpeg", "images")
+CAMERA_PLUGINS = "gonio.cameras"
 MODELS = ("XM430-W350", "XL430-W250", "XL330-M288")
 
 
@@ -90,7 +92,9 @@ class CameraConfig:
     Attributes
     ----------
     kind : str
-        ``"sim"``, ``"opencv"`` or ``"none"``.
+        ``"sim"``, ``"opencv"``, ``"none"``, or the name of a plug-in (entry point of the group `CAMERA_PLUGINS`).
+    options : mapping
+        ``[camera.options]``, which a plug-in gets as they are.
     exposures_s : tuple of float
         Exposure bracket [s], ascending.
     roi : tuple of int
@@ -106,7 +110,7 @@ class CameraConfig:
         cannot be set (then `exposures_s` has one entry, which says what it is).
     """
 
-    kind: Literal["sim", "opencv", "none"]
+    kind: str
     exposures_s: tuple[float, ...]
     roi: tuple[int, int, int, int]
     distance_mm: float
@@ -125,6 +129,7 @@ class CameraConfig:
     channel: int | None
     stale_frames: int | None
     fixed: bool
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -324,7 +329,8 @@ def _axis(table: Table, name: str) -> AxisConfig:
 
 
 def _camera(table: Table, sim: SimConfig | None) -> CameraConfig:
-    kind = table.text("kind", choices=("sim", "opencv", "none"))
+    plugins = tuple(dict.fromkeys(point.name for point in entry_points(group=CAMERA_PLUGINS)))
+    kind = table.text("kind", choices=("sim", "opencv", "none", *plugins))
     if kind == "sim":
         # the simulated sensor has its size from [sim.truth], where the simulator checks it
         size = {"width": 160, "height": 120} | (dict(sim.truth) if sim else {})
@@ -340,7 +346,7 @@ def _camera(table: Table, sim: SimConfig | None) -> CameraConfig:
     else:
         device = table.integer("device", 0, lower=0, upper=99)
     config = CameraConfig(
-        kind=kind,  # type: ignore[arg-type]
+        kind=kind,
         exposures_s=table.numbers("exposures_s", above=0.0, upper=3600.0, unit="s"),
         roi=roi,  # type: ignore[arg-type]
         distance_mm=table.number("distance_mm", above=0.0, upper=1e5, unit="mm"),
@@ -359,8 +365,11 @@ def _camera(table: Table, sim: SimConfig | None) -> CameraConfig:
         channel=table.integer("channel", lower=0, upper=3) if "channel" in table else None,
         stale_frames=table.integer("stale_frames", lower=0, upper=100, unit="frames") if "stale_frames" in table else None,
         fixed=table.flag("fixed", False),
+        options=table.table("options", required=False).free(),
     )
     table.finish()
+    if config.options and kind not in plugins and table.get("kind") == kind:
+        table.report("options", f'goes with the kind of a plug-in only, not with "{kind}"')
     exposures = config.exposures_s
     if any(b <= a for a, b in itertools.pairwise(exposures)):
         table.report("exposures_s", f"is {list(exposures)}; write each exposure once, the shortest first")

@@ -19,11 +19,13 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gonio.config import AxisConfig, CameraConfig, RigConfig, SimConfig
-from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError
+from gonio.config.rig import CAMERA_PLUGINS
+from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError, GonioError
 from gonio.interfaces import Axis, Camera, Clock, Lamp
 
 if TYPE_CHECKING:
@@ -242,8 +244,10 @@ def _real(config: RigConfig, stack: ExitStack, ask: Ask | None) -> Rig:
 
 
 def _camera(config: CameraConfig, clock: Clock) -> Camera | None:
-    if config.kind != "opencv":
+    if config.kind == "none":
         return None
+    if config.kind != "opencv":
+        return _plugged_in(config, clock)
     from drivers.opencv_camera import OpenCVCamera
 
     return OpenCVCamera(
@@ -262,6 +266,26 @@ def _camera(config: CameraConfig, clock: Clock) -> Camera | None:
         channel=config.channel,
         stale_frames=config.stale_frames,
     )
+
+
+def _plugged_in(config: CameraConfig, clock: Clock) -> Camera:
+    """A camera of another package: the entry point is called with the clock and [camera.options]."""
+    points = [point for point in entry_points(group=CAMERA_PLUGINS) if point.name == config.kind]
+    owner = " and ".join(point.dist.name if point.dist else "an unnamed package" for point in points)
+    if len({point.value for point in points}) != 1:
+        raise ConfigurationError(f"there are {len(points)} cameras {config.kind!r}, by {owner or 'no package'}; have one")
+    try:
+        camera = points[0].load()(clock=clock, **config.options)
+    except GonioError:
+        raise
+    except Exception as error:  # whatever the code of others raises
+        raise DeviceError(
+            f"the camera {config.kind!r} of {owner} ({points[0].value}) cannot be opened, {type(error).__name__}: {error}; "
+            "check [camera.options] against its manual"
+        ) from error
+    if not isinstance(camera, Camera):
+        raise ConfigurationError(f"{owner}: {points[0].value} makes a {type(camera).__name__}, which is no gonio camera")
+    return camera
 
 
 def _connect(bus: Bus, config: RigConfig, stack: ExitStack, *, watchdog_s: float | None = None) -> dict[str, Axis]:
@@ -330,7 +354,7 @@ def _served(config: RigConfig, sim: SimConfig, stack: ExitStack, faults: bool) -
     from sim.clock import ScaledClock
 
     ready = _start_simulator(config, sim, stack, faults)
-    clock = ScaledClock(float(ready["speed"]))
+    clock = ScaledClock(float(ready["speed"]), int(ready["start_ns"]))
     camera = SocketCamera(ready["camera"])
     stack.callback(camera.close)
     lamp = ScpiLamp(ready["lamp"], baud=config.lamp.baud, timeout_s=config.lamp.timeout_s)
