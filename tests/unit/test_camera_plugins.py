@@ -49,7 +49,7 @@ def test_the_page_runs_as_it_stands(installed: None) -> None:
 
 
 def test_without_the_package_the_kind_is_unknown() -> None:
-    with pytest.raises(ConfigurationError, match="kind = 'grey_card' is not known; choose from: sim, opencv, none$"):
+    with pytest.raises(ConfigurationError, match=r"kind = 'grey_card' is not known; choose from: sim, opencv, none$"):
         parse_rig(rig(OPTIONS.removeprefix("[camera]\n")))
 
 
