@@ -23,6 +23,7 @@ _DEGREE = 15
 _SAFETY = 3.0
 _MOST_PIECES = 200
 _DEEPEST = 24
+_TO_LIMB = 4.0  # by which a piece may come nearer to the limb than it began
 _PATCHING = 0.05  # of the tolerance, for reading between the nodes
 
 
@@ -82,7 +83,9 @@ def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
     waves, scale = _waves(scene, lowest, highest, digits, rtol, room)
     scale = max(scale, room.largest)
     count = max(1, math.ceil((highest - lowest) * min(waves, 64) / 9.0))
-    edges = np.linspace(lowest, highest, count + 1)
+    edges = np.linspace(lowest, highest, count + 1).tolist()
+    while 1.0 - edges[-2] > _TO_LIMB * (1.0 - highest) and highest < 1.0:  # seen along the surface, R may be singular
+        edges.insert(-1, 1.0 - max((1.0 - edges[-2]) / _TO_LIMB, (1.0 - highest) * 1.0001))
     pending = [_Piece(float(a), float(b), digits, waves) for a, b in itertools.pairwise(edges)]
     done: list[tuple[_Piece, _Trial]] = []
     while pending:
