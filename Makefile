@@ -1,10 +1,10 @@
-# make demo | test | lint | gates | bench
+# make demo | test | lint | gates | bench | conformance
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/installed.stamp
 
-.PHONY: demo test lint gates bench clean
+.PHONY: demo test lint gates bench conformance clean
 # constraints.txt pins what was tested on one Python version; other versions resolve freely.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -35,6 +35,13 @@ bench: $(STAMP)
 	  $(BIN)/pip install --quiet --disable-pip-version-check -e '.[bench]' $$pin 2>/dev/null || \
 	  echo "mitsuba cannot be installed here; its rows are left out"; }
 	$(BIN)/python -m tests.benchmarks
+
+# pySCATMECH comes as source: a C++ compiler and some minutes.
+conformance: $(STAMP)
+	@if $(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'; then pin="-c constraints.txt"; fi; \
+	  $(BIN)/pip install --quiet --disable-pip-version-check -e '.[conformance]' $$pin
+	$(BIN)/python -m pytest tests/conformance/test_third_party.py
+	$(BIN)/python -m tests.conformance --write
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

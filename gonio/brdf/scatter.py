@@ -51,7 +51,8 @@ def abg_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p:
 
 @jit.model
 def harvey_shack_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
-    x, y = (xi + xr) / p[1], (yi + yr) / p[1]
+    scale = 1.0 / p[1]
+    x, y = scale * (xi + xr), scale * (yi + yr)
     value = p[0] * exp(0.5 * p[2] * log1p(x * x + y * y))
     return value if (zi > 0.0) & (zr > 0.0) else 0.0
 

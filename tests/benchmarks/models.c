@@ -3,7 +3,8 @@
 
    Parameters stand in p as gonio has them: in the order of `gonio models NAME`, then the derived numbers. For every model
    NAME_loop(omega_i, omega_r, p, weight, out, n) adds weight f_r at n pairs of directions, arrays of structs, to out. What
-   is divided or calls libm stands before the choice `lit ? value : 0.0`: behind it, gcc does not vectorise the loop. */
+   is divided or calls libm stands before the choice `lit ? value : 0.0`: behind it, gcc does not vectorise the loop. Nor does
+   gcc 12 where numbers are looked up at computed places (tables) or only one of three coordinates is read. */
 #include <math.h>
 
 #define INV_PI 0.31830988618379067154
@@ -25,6 +26,9 @@
     double mu_i = lit ? zi : 1.0, mu_r = lit ? zr : 1.0;
 
 #define INLINE static inline __attribute__((always_inline)) double
+
+/* x^y of x > 0, by two calls of which libm has fast vector forms; its pow, of more digits than count here, is slower */
+INLINE power(double x, double y) { return exp(y * log(x)); }
 
 /* --- diffuse ------------------------------------------------------------------------------------------------------ */
 
@@ -78,7 +82,7 @@ MODEL(eon)
 MODEL(minnaert)
 {
     LIT
-    double value = p[0] * INV_PI * pow(fmax(mu_i * mu_r, 1e-300), p[1] - 1.0);
+    double value = p[0] * INV_PI * power(fmax(mu_i * mu_r, 1e-300), p[1] - 1.0);
     return lit ? value : 0.0;
 }
 
@@ -165,7 +169,7 @@ MODEL(phong)
     LIT
     double along = 2.0 * mu_i * mu_r - (xi * xr + yi * yr + mu_i * mu_r);
     lit = lit & (along > 0.0);
-    double value = p[0] * (p[1] + 2.0) * 0.5 * INV_PI * pow(fmax(along, 1e-300), p[1]);
+    double value = p[0] * (p[1] + 2.0) * 0.5 * INV_PI * power(lit ? along : 1.0, p[1]);
     return lit ? value : 0.0;
 }
 
@@ -174,7 +178,7 @@ MODEL(lafortune)
     LIT
     double along = p[1] * (xi * xr + yi * yr) + p[2] * (mu_i * mu_r), largest = fmax(fabs(p[1]), p[2]);
     lit = lit & (along > 0.0);
-    double value = p[0] * (p[3] + 2.0) * 0.5 * INV_PI * pow(fmax(along / largest, 1e-300), p[3]);
+    double value = p[0] * (p[3] + 2.0) * 0.5 * INV_PI * power(lit ? along / largest : 1.0, p[3]);
     return lit ? value : 0.0;
 }
 
@@ -184,7 +188,7 @@ MODEL(blinn_phong)
 {
     LIT
     double x = xi + xr, y = yi + yr, n = p[1];
-    double norm = (n + 2.0) * (n + 4.0) / (8.0 * PI * (pow(2.0, -0.5 * n) + n));
+    double norm = (n + 2.0) * (n + 4.0) / (8.0 * PI * (power(2.0, -0.5 * n) + n));
     double value = p[0] * norm * cosine_power(x * x + y * y, mu_i + mu_r, n);
     return lit ? value : 0.0;
 }
@@ -230,7 +234,7 @@ MODEL(ward_gmd)
 MODEL(abg)
 {
     double x = xi + xr, y = yi + yr;
-    double value = p[0] / (p[1] + pow(x * x + y * y, 0.5 * p[2]));
+    double value = p[0] / (p[1] + power(x * x + y * y, 0.5 * p[2]));
     return (zi > 0.0) & (zr > 0.0) ? value : 0.0;
 }
 
@@ -342,15 +346,16 @@ INLINE std_m(double mu, double s2, const double *restrict p)
 {
     double b2 = (p[2] - 1.0) * p[1] * p[1] * s2, q2 = mu * mu + b2;
     double t = fmin(mu / (mu + p[4] * sqrt(q2)) * p[5] - 1.0, 1.0), w = p[26];
+#pragma GCC unroll 20
     for (int k = 20; k > 0; k--)
         w = w * t + p[5 + k];
-    return p[1] * sqrt(s2) * w * pow(b2 / q2, p[2] - 1.5);
+    return p[1] * sqrt(s2) * w * power(b2 / q2, p[2] - 1.5);
 }
 
 MODEL(microfacet_std)
 {
     HALF
-    double z2 = z * z, d = pow(1.0 + s2 / ((p[2] - 1.0) * a2 * z2), -p[2]) * INV_PI * h.l2 * h.l2 / (a2 * z2 * z2);
+    double z2 = z * z, d = power(1.0 + s2 / ((p[2] - 1.0) * a2 * z2), -p[2]) * INV_PI * h.l2 * h.l2 / (a2 * z2 * z2);
     double value = p[0] * schlick(h, p[3]) * d * SMITH(std_m(mu_i, h.si2, p), std_m(mu_r, h.sr2, p));
     return lit ? value : 0.0;
 }
@@ -363,6 +368,7 @@ INLINE pieces(double x, const double *restrict table, long count)
     double t = 2.0 * (x - (double)piece) - 1.0;
     const double *c = table + 19 * piece;
     double value = c[18];
+#pragma GCC unroll 18
     for (int k = 17; k >= 0; k--)
         value = value * t + c[k];
     return value;
@@ -377,7 +383,7 @@ INLINE gtr_m(double mu, double s2, const double *restrict p)
 MODEL(microfacet_gtr)
 {
     HALF
-    double d = p[4] * pow(h.l2 / (a2 * z * z + s2), p[2]);
+    double d = p[4] * power(h.l2 / (a2 * z * z + s2), p[2]);
     double value = p[0] * schlick(h, p[3]) * d * SMITH(gtr_m(mu_i, h.si2, p), gtr_m(mu_r, h.sr2, p));
     return lit ? value : 0.0;
 }
