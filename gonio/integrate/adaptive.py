@@ -38,6 +38,7 @@ _CHUNK = 1024  # cells evaluated at once: 30 MiB
 _LARGEST = 1 << 24  # nodes for one element
 _SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of the rules
 _GROWTH = 8.0  # of panels away from the horizon
+_GRAZING = 0.05  # cosine below which a view is grazing: its lobe is a streak
 _DEEPEST = 2.0**-40  # of a base cell's side
 _RULES = np.stack((KRONROD, GAUSS), axis=1)
 
@@ -177,8 +178,17 @@ def over_field(
     """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared.
 
     Polar coordinates about the normal, or else about the field's own pole; by default the pole for an environment map, whose
-    rows are rings about it, and the normal for the others.
+    rows are rings about it, unless the view is grazing, when more circles lie along the horizon; the normal for the others.
     """
+    if about_normal is None and isinstance(field, EnvironmentMap):
+        value, error = np.zeros(len(elements)), np.zeros(len(elements))
+        grazing = elements.cos_theta < _GRAZING
+        for local in (False, True):
+            some = np.flatnonzero(grazing == local)
+            value[some], error[some] = over_field(
+                term, field, elements.select(some), rtol=rtol, atol=atol, effort=effort, about_normal=local
+            )
+        return value, error
     n = len(elements)
     # (n, 3, 3), from viewer-oriented to local
     turn = np.stack([elements.local(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
@@ -187,7 +197,7 @@ def over_field(
         return field.at(np.einsum("ij,ijk->ik", directions, turn[element]))
 
     light = Light(radiance)
-    region = Region(turn[:, :, 2], math.pi, not isinstance(field, EnvironmentMap) if about_normal is None else about_normal)
+    region = Region(turn[:, :, 2], math.pi, about_normal is not False)
     if isinstance(field, Lobes):
         lit = field.amplitude > 0
         peaks = np.einsum("nij,fj->nfi", turn, field.axes()[lit])
@@ -364,7 +374,7 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
         # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
         layer = max(1e-9, min(float(fixed[k, 2]), term.layer_width()))
         own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
-        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < 0.05:
+        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < _GRAZING:
             own.append(_streak(fixed[k], max(1e-9, (term.lobe_width() or 1.0) * float(fixed[k, 2]))))
         if light is not None and light.planes is not None:
             own.append(light.planes[k].tolist())

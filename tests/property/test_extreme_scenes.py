@@ -69,7 +69,7 @@ def test_a_hundred_thousand_extreme_scenes() -> None:
     scenes_run, faults = sum(row["scenes"] for row in done), sum(len(row["faults"]) for row in done)
     record(
         "extreme scenes",
-        f"{faults} of {scenes_run} scenes with a crash, a NaN or a silent zero; {sum(row['seconds'] for row in done):.0f} s",
+        f"{faults} of {scenes_run} scenes with a crash, a NaN or a silent zero; {sum(row['seconds'] for row in done):.0f} s of a core",
         "10^5 scenes without crash, NaN or silent zero",
         "0 to 99",
         "pytest -m gate tests/property/test_extreme_scenes.py -k thousand_extreme_scenes -s",
