@@ -2,8 +2,8 @@
 
 OpenCV's properties mean something else in every backend and are often ignored without a word. So the backend is forced
 by name; a setting counts only if it reads back; exposure is converted to and from the backend's unit; frames that began
-before the exposure was set are thrown away; and shape, type and bit depth of what arrives are checked. A camera whose
-automatic exposure cannot be switched off is refused, unless its exposure is declared fixed.
+before the call are thrown away (`drivers.opencv_stream`); and shape, type and bit depth of what arrives are checked. A
+camera whose automatic exposure cannot be switched off is refused, unless its exposure is declared fixed.
 
 It does not linearise, subtract darks or average; whether counts are proportional to light is declared by the user and
 contradicted where the camera's gamma control says otherwise. A sequence of image files (backend ``images``) is a camera
@@ -21,7 +21,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from gonio.errors import ConfigurationError, DeviceError
+from drivers.opencv_stream import NoFrameError, Stream
+from gonio.errors import ConfigurationError, DeviceError, MeasurementError
 from gonio.interfaces import Clock, Frame
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_INTERVAL_S = 1.0 / 30.0  # of a camera that does not say
+_CONTRAST_DN = 2.0
 _SAME = 1e-6  # relative; a fixed exposure is the one asked for
 _AUTOMATIC = (0.75, 2.0, 3.0)  # V4L2: as old drivers say it, shutter priority, aperture priority
 
@@ -102,8 +105,8 @@ class OpenCVCamera:
     channel : int, optional
         Which channel to keep of data with several; they are refused without.
     stale_frames : int, optional
-        Frames thrown away before each one that is kept: those queued in the driver (V4L2 keeps about 4) and those that
-        a new exposure takes to arrive. Default 6, and 0 for image files.
+        Frames thrown away before each one that is kept, after the driver's queue is empty: those that were under way. By
+        default 6 until `measure_late` knows better, and 0 for image files.
     open_capture : callable, optional
         ``cv2.VideoCapture``, or what offers the same methods.
 
@@ -150,7 +153,6 @@ class OpenCVCamera:
         self._saturation_dn = saturation_dn
         self._linear = linear
         self._channel = channel
-        self._stale = stale_frames if stale_frames is not None else 6 if self._backend.live else 0
         self._shape: tuple[int, int] | None = None
         self._settings: dict[str, float] = {}
         self._exposure_value: float | None = None  # last set, in the backend's unit
@@ -165,6 +167,11 @@ class OpenCVCamera:
                     "program uses it, and the device's name."
                 )
             self._set_up(width, height, fourcc, gain)
+            rate = float(self._capture.get(cv2.CAP_PROP_FPS))
+            interval_s = 1.0 / rate if 1.0 <= rate <= 1000.0 else _INTERVAL_S
+            self._stream = Stream(
+                self._capture, clock, live=self._backend.live, interval_s=interval_s, late=stale_frames
+            )
         except BaseException:
             self.close()
             raise
@@ -270,14 +277,12 @@ class OpenCVCamera:
         """
         if not (math.isfinite(exposure_s) and exposure_s > 0.0):
             raise ConfigurationError(f"{self._label}: exposure {exposure_s:g} s must be above 0.")
+        earlier = self._exposure_value
         actual_s = self._set_exposure(exposure_s)
-        for _ in range(self._stale):
-            if not self._capture.grab():
-                raise self._no_frame()
-        ok, data = self._capture.read()
-        taken_s = self._clock.now()
-        if not ok or data is None:
-            raise self._no_frame()
+        try:
+            data, taken_s = self._stream.fresh(changed=self._exposure_value != earlier)
+        except NoFrameError:
+            raise self._no_frame() from None
         counts, bit_depth = self._counts(data)
         full = 2**bit_depth - 1
         gain = float(self._settings.get("gain", math.nan))
@@ -293,10 +298,50 @@ class OpenCVCamera:
             metadata={
                 "backend": self._backend_name,
                 "stream_position_ms": float(self._capture.get(self._cv2.CAP_PROP_POS_MSEC)),
-                "stale_frames_discarded": self._stale,
+                "stale_frames_discarded": self._stream.late,
                 "exposure_requested_s": exposure_s,
             },
         )
+
+    def measure_late(self, light: Callable[[bool], object], exposure_s: float) -> int:
+        """Find with a light that is switched how many frames show the past, and throw that many away from now on.
+
+        Parameters
+        ----------
+        light : callable
+            Switches the light and returns when it has; it is on afterwards.
+        exposure_s : float
+            At which the light makes a difference [s].
+
+        Returns
+        -------
+        int
+            Frames thrown away before each one that is kept.
+
+        Raises
+        ------
+        MeasurementError
+            If frames do not show whether the light is on.
+        DeviceError
+            If the camera sends none.
+        """
+        light(False)
+        dark = self.capture(exposure_s, label="light off").data
+        light(True)
+        lit = self.capture(exposure_s, label="light on").data
+        means, spread = [float(d.mean()) for d in (dark, lit)], float(max(dark.std(), lit.std())) / math.sqrt(dark.size)
+        if means[1] - means[0] < max(_CONTRAST_DN, 10.0 * spread):
+            raise MeasurementError(
+                f"{self._label} does not show whether the light is on ({means[0]:.1f} and {means[1]:.1f} counts at "
+                f"{exposure_s:g} s); put something bright before it, or expose longer."
+            )
+        middle = 0.5 * (means[0] + means[1])
+        try:
+            late = self._stream.measure_late(light, lambda data: bool(self._counts(data)[0].mean() > middle))
+        except NoFrameError:
+            raise self._no_frame() from None
+        logger.info("%s: %d frames are thrown away before each that counts", self._label, late)
+        return late
 
     def describe(self) -> dict[str, object]:
         """Identity and settings for the run's metadata (JSON-compatible)."""
@@ -308,7 +353,7 @@ class OpenCVCamera:
             "opencv": str(self._cv2.__version__),
             "exposure": "manual" if self._fixed_s is None else "fixed",
             "linear": self._linear,
-            "stale_frames": self._stale,
+            "stale_frames": self._stream.late,
             "settings": dict(self._settings),
         }
 

@@ -7,7 +7,7 @@ on a virtual one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -166,6 +166,15 @@ class Camera(Protocol):
     def describe(self) -> Mapping[str, object]: ...
 
     def close(self) -> None: ...
+
+
+@runtime_checkable
+class StreamingCamera(Camera, Protocol):
+    """A camera whose frames may show the past, and which can find out by how many."""
+
+    def measure_late(self, light: Callable[[bool], object], exposure_s: float) -> int:
+        """Switch the light with `light`, count the frames that show it as it was, and throw that many away from now on."""
+        ...
 
 
 @runtime_checkable

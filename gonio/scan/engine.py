@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import gonio
 from gonio.errors import ConfigurationError, DatasetError, DeviceError, MeasurementError
-from gonio.interfaces import Axis, Camera, Clock, Frame, Lamp
+from gonio.interfaces import Axis, Camera, Clock, Frame, Lamp, StreamingCamera
 from gonio.scan import preflight
 from gonio.scan.exposure import Exposer
 from gonio.scan.interrupt import Interrupts, interrupts
@@ -149,6 +149,7 @@ class _Scan:
         try:
             self._begin(resumed=bool(done))
             self._home()
+            self._find_late_frames()
             self._darks()
             self._rig.lamp.set_level(self._config.lamp.level)
             self._rig.lamp.set_output(True)
@@ -195,6 +196,21 @@ class _Scan:
         self._progress("home", 0, 1)
         self._motion.move(self._reference())
         self._progress("home", 1, 1)
+
+    def _find_late_frames(self) -> None:
+        """With the lamp, how many frames of a streaming camera show the past; what it assumes stays if light makes no
+        difference."""
+        camera, lamp = self._rig.camera, self._rig.lamp
+        if self._config.lamp.kind == "manual" or not isinstance(camera, StreamingCamera):
+            return
+        lamp.set_level(self._config.lamp.level)
+        try:
+            late = camera.measure_late(lamp.set_output, self._exposer.exposures_s[-1])
+            logger.info("%d frames are thrown away before each that counts", late)
+        except MeasurementError as error:
+            logger.warning("late frames: %s", error)
+        finally:
+            lamp.set_output(False)
 
     def _reference(self) -> dict[str, float]:
         """Joint angles of the white reference's geometry [rad]."""

@@ -1,7 +1,7 @@
 """The OpenCV camera: real image files through cv2, and a stand-in for the hardware that no test machine has.
 
 The stand-in sits where ``cv2.VideoCapture`` sits and models what cameras really do: units of the backend, a queue of old
-frames, an exposure that takes frames to arrive, automatic exposure that is on. It does not model noise or timing.
+frames, an exposure that takes frames to arrive, automatic exposure that is on. It does not model noise.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ def test_a_backend_that_does_not_exist() -> None:
 class StandIn:
     """A camera in the place of ``cv2.VideoCapture``; every frame shows in its pixels how long it was exposed.
 
-    The exposure that is set works `latency` frames later, and `queue` finished frames wait to be read.
+    The exposure that is set works `latency` frames later, and `queue` finished frames wait to be read. A further one has
+    to be waited for.
     """
 
     def __init__(self, backend: str = "v4l2", *, queue: int = 4, latency: int = 2, automatic: float | None = None) -> None:
@@ -128,6 +129,8 @@ class StandIn:
         if backend == "v4l2":
             self.properties[cv2.CAP_PROP_AUTO_EXPOSURE] = 3.0 if automatic is None else automatic
             self.properties[cv2.CAP_PROP_GAMMA] = 120.0
+        self.clock = VirtualClock()
+        self.queued = queue
         self.pipeline = deque([self.properties[cv2.CAP_PROP_EXPOSURE]] * (queue + latency))
         self.sets: list[tuple[int, float]] = []
         self.released = False
@@ -151,6 +154,10 @@ class StandIn:
         return True
 
     def grab(self) -> bool:
+        if self.queued:
+            self.queued -= 1
+        else:
+            self.clock.sleep(1.0 / 30.0)
         self.now = self.pipeline.popleft()
         self.pipeline.append(self.properties[cv2.CAP_PROP_EXPOSURE])
         return True
@@ -161,7 +168,7 @@ class StandIn:
 
 
 def hardware(device: StandIn, **changes: Any) -> OpenCVCamera:
-    options: dict[str, Any] = {"backend": device.backend, "clock": VirtualClock(), "open_capture": lambda *_: device}
+    options: dict[str, Any] = {"backend": device.backend, "clock": device.clock, "open_capture": lambda *_: device}
     return OpenCVCamera(0, **(options | changes))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.opencv_camera import OpenCVCamera
-from gonio.errors import ConfigurationError, DeviceError
+from gonio.errors import ConfigurationError, DeviceError, MeasurementError
 from sim.board import charuco
 from sim.capture import PROFILES, SimCapture, write_images
 from sim.clock import ScaledClock
@@ -253,3 +253,24 @@ def test_the_board_is_found_by_opencvs_detector_where_it_is():
         place = np.array([cp * x + sp * st * y, ct * y, -sp * x + cp * st * y])
         seen = place[:2] * 600 / (600 - place[2])
         assert (u, v) == pytest.approx((seen[0] / 0.1 + 239.5, 179.5 - seen[1] / 0.1), abs=0.2)
+
+
+@pytest.mark.parametrize("profile", ["v4l2", "dshow"])
+def test_late_frames_are_found_with_the_lamp(profile):
+    """Rationale: the driver may not know how late a camera's frames are. Expected: it finds out, and may then hurry."""
+    simulation = bench()
+    capture = stream(simulation, profile)
+    camera = OpenCVCamera(
+        0, backend=profile, clock=simulation.clock, bit_depth=12, open_capture=lambda device, backend: capture
+    )
+
+    def light(on):
+        simulation.lamp.feed(b"OUTP ON\n" if on else b"OUTP OFF\n", simulation.clock.now())
+
+    exposure_s = 0.016 if profile == "v4l2" else 2.0**-6
+    assert 1 <= camera.measure_late(light, exposure_s) <= 3
+    simulation.clock.sleep(1.0)
+    simulation.camera.mount("trap")
+    assert camera.capture(exposure_s, label="trap").data.mean() < DARK
+    with pytest.raises(MeasurementError, match="does not show whether the light is on"):
+        camera.measure_late(light, exposure_s)
