@@ -40,7 +40,23 @@ def brushed(alpha_x: float = 0.15, alpha_y: float = 0.4) -> Material:
         lobe = np.exp(-xy / s[:, 2] ** 2) * np.sum(s * s, axis=1) / (np.pi * alpha_x * alpha_y * s[:, 2] ** 4)
         return np.asarray(0.2 / np.pi + 0.3 * lobe)
 
-    brdf = gonio.brdf.from_function(f, name="brushed", isotropic=False, reciprocal=True, lobe_width=0.7 * alpha_x)
+    brdf = gonio.brdf.from_function(
+        f, name="brushed", isotropic=False, reciprocal=True, lobe_width=0.7 * min(alpha_x, alpha_y)
+    )
+    return Material((brdf,), attributes={"origin": "model"})
+
+
+def turned(angle: float, alpha_x: float = 0.15, alpha_y: float = 0.4) -> Material:
+    """`brushed` with its grain turned counter-clockwise by an angle [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    back = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    straight = brushed(alpha_x, alpha_y).brdfs[0]
+
+    def f(omega_i: Array, omega_r: Array) -> Array:
+        return straight.evaluate(omega_i @ back.T, omega_r @ back.T)
+
+    width = 0.7 * min(alpha_x, alpha_y)
+    brdf = gonio.brdf.from_function(f, name="turned", isotropic=False, reciprocal=True, lobe_width=width)
     return Material((brdf,), attributes={"origin": "model"})
 
 

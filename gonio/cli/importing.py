@@ -16,9 +16,10 @@ from gonio.cli.output import json_option, log_to, speaking
 @click.option(
     "--quantity", type=click.Choice(["brdf", "brf", "brdf_cos"]), help="What the values are, where the file does not say."
 )
+@click.option("--channel", help="Of a file with several: its name, such as red or 550nm; luminance or 555 nm by default.")
 @json_option
-def import_(file: Path, out: Path, quantity: str | None, as_json: bool) -> None:
-    """Make a run from FILE: OpticStudio tabular .bsdf, Cornell/pbrt .brdf, MERL .binary, gonio NetCDF or samples CSV.
+def import_(file: Path, out: Path, quantity: str | None, channel: str | None, as_json: bool) -> None:
+    """Make a run from FILE in any format that gonio reads, such as OpticStudio, MERL, RGL, Klems, BiRD, NetCDF, CSV.
 
     The format is recognised by content. Values without uncertainty stay so; a fit then infers their noise.
     """
@@ -26,7 +27,7 @@ def import_(file: Path, out: Path, quantity: str | None, as_json: bool) -> None:
     from gonio.scan import Run
 
     with speaking(as_json) as output:
-        samples = formats.read_samples(file, quantity)
+        samples = formats.read_samples(file, quantity, channel)
         attributes = {"source_file": file.name, "source_sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
         attributes |= {"gonio_version": __version__, "source_format": formats.sniff(file)}
         with Run.create(out, kind="import", documents={}, attributes=attributes) as run:

@@ -227,11 +227,15 @@ def compute_map(
 def export(run: Run, name: str, path: Path, output: Output) -> None:
     """Write the data set of a run in one format."""
     from gonio import formats
+    from gonio.formats.quantity import QUANTITIES
 
     samples = run.read_samples() if run.has_samples() else None
     table = load_table(run) if run.table_path.exists() else None
     posterior = load_posterior(run) if run.posterior_path.exists() else None
     path.parent.mkdir(parents=True, exist_ok=True)
+    form = formats.FORMATS.get(name)
+    if form is not None and form.writes == "grid":
+        _warn_of_coverage(output, samples, table, posterior)
     formats.export(
         name,
         path,
@@ -240,8 +244,25 @@ def export(run: Run, name: str, path: Path, output: Output) -> None:
         brdf=None if posterior is None else posterior.brdf(),
         attributes={"run": run.path.name},
     )
-    output.say(f"wrote {path}: f_r in 1/sr, {formats.FORMATS[name].doc}")
-    output.result(file=path, format=name, quantity="brdf")
+    form = formats.FORMATS[name]
+    stated = form.quantity or "brdf"
+    output.say(f"wrote {path}: {QUANTITIES[stated]}; {form.doc}")
+    output.result(file=path, format=name, quantity=stated)
+
+
+def _warn_of_coverage(
+    output: Output, samples: BRDFSamples | None, table: TabulatedBRDF | None, posterior: Posterior | None
+) -> None:
+    """Say what of a file that holds every direction was not measured."""
+    if table is not None:
+        counts = table.counts()
+        above = sum(n for name, n in counts.items() if name != "below_horizon")
+        guessed = counts["extrapolated"] + counts["model"]
+        if guessed > 0.1 * above:
+            source = "a fitted model" if counts["model"] else "extrapolation"
+            output.warn(f"{100 * guessed / above:.0f} % of the table's nodes were not measured and come from {source}")
+    elif posterior is not None and samples is not None:
+        output.warn(f"there is no table: all directions come from the fit of {posterior.model} to {len(samples)} samples")
 
 
 def report(

@@ -212,13 +212,13 @@ def grid_of(material: Material) -> Grid:
     width = material.lobe_width()
     # even steps of ln(1 + (theta_h / s)^2): dense within the lobe, some per cent of the angle beyond it
     s = float(np.clip(0.5 * width, 1e-4, 0.5))
-    step = np.linspace(0.0, np.log1p((np.pi / 2 / s) ** 2), 90 if width > 0.02 else 140)
+    step = np.linspace(0.0, np.log1p((np.pi / 2 / s) ** 2), 128 if width > 0.02 else 192)
     theta_h = np.degrees(s * np.sqrt(np.expm1(step)))
     theta_h[-1] = 90.0
     fold = material.isotropic and material.reciprocal
     # finer towards grazing, where Fresnel and shadowing bend
-    theta_d = np.degrees(np.arccos(np.linspace(1.0, 0.0, 49)))
-    theta_d = np.unique(np.concatenate((np.arange(0.0, 60.0, 2.5), theta_d[theta_d >= 60.0])))
+    theta_d = np.degrees(np.arccos(np.linspace(1.0, 0.0, 61)))
+    theta_d = np.unique(np.concatenate((np.arange(0.0, 60.0, 2.0), theta_d[theta_d >= 60.0])))
     phi_d = np.linspace(0.0, 90.0, 31) if fold else np.linspace(0.0, 360.0, 37)
     phi_h = np.zeros(1) if material.isotropic else np.linspace(0.0, 360.0, 37)
     if not material.isotropic:

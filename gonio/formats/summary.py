@@ -1,0 +1,115 @@
+"""What a file holds, in numbers: quantity, channels, coverage, energy, reciprocity. What `gonio info` prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gonio import files, formats
+from gonio.brdf.tabulated import TabulatedBRDF, tabulate
+from gonio.channels import ChannelSamples
+from gonio.errors import DatasetError, IntegrationError
+from gonio.formats import quantity as quantities
+from gonio.integrate import directional_albedo
+from gonio.samples import BRDFSamples
+
+Array = NDArray[np.float64]
+ALBEDO_DEG = (0.0, 30.0, 60.0)
+MOST = 4000  # samples of which a table is made to judge the energy
+SAME = 1e-4  # directions closer than this [rad] count as one
+FULL_HEMISPHERE_BINS = 12 * 6  # of azimuth and of polar angle
+
+
+def describe(path: Path, quantity: str | None = None) -> dict[str, Any]:
+    """Facts of a file of any known format, ready for JSON.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read.
+    """
+    name = formats.sniff(path)
+    form = formats.FORMATS[name]
+    found = formats.read(path, quantity)
+    out: dict[str, Any] = {"file": str(path), "bytes": files.size_of(path), "format": name, "format_doc": form.doc}
+    stated = quantity or form.quantity
+    out["quantity_in_file"] = quantities.QUANTITIES[stated] if stated else "as the file says: see source_quantity"
+    out["quantity_read"] = quantities.QUANTITIES["brdf"]
+    if isinstance(found, TabulatedBRDF):
+        out |= {"table_nodes": list(found.shape), "coverage": found.counts(), "attributes": dict(found.attributes)}
+        return out | energy_of(found)
+    channels = ChannelSamples.of(found) if isinstance(found, BRDFSamples) else found
+    one = found if isinstance(found, BRDFSamples) else found.channel()
+    out |= {
+        "samples": len(channels),
+        "channels": list(channels.channels.names),
+        "channel_shown": one.attributes.get("channel", channels.channels.names[0]),
+        "attributes": dict(channels.attributes),
+    }
+    return out | coverage_of(one) | reciprocity_of(one) | energy_of(one)
+
+
+def coverage_of(samples: BRDFSamples) -> dict[str, Any]:
+    """Which directions there are, and how far up the values and uncertainties go."""
+    incidence = np.unique(np.round(np.degrees(samples.theta_i), 3))
+    azimuth = np.unique(np.round(np.degrees(samples.phi_i), 3))
+    relative = np.mod(samples.phi_r - samples.phi_i, 2 * np.pi)
+    of_azimuth = np.minimum(np.floor(relative / (2 * np.pi) * 12 + 1e-9), 11).astype(int)
+    bins = of_azimuth * 6 + np.minimum(np.floor(samples.theta_r / (np.pi / 2) * 6), 5).astype(int)
+    known = np.isfinite(samples.u_f_r)
+    out: dict[str, Any] = {
+        "incidences_deg": incidence.tolist() if len(incidence) <= 24 else [float(incidence[0]), float(incidence[-1])],
+        "n_incidences": len(incidence),
+        "n_incident_azimuths": len(azimuth),
+        "theta_r_deg": [float(np.degrees(samples.theta_r.min())), float(np.degrees(samples.theta_r.max()))],
+        "hemisphere_covered": len(np.unique(bins)) / FULL_HEMISPHERE_BINS,
+        "f_r": [float(samples.f_r.min()), float(samples.f_r.max())],
+        "with_uncertainty": int(np.count_nonzero(known)),
+        "negative": int(np.count_nonzero(samples.f_r < 0)),
+    }
+    if np.any(known & (samples.f_r > 0)):
+        take = known & (samples.f_r > 0)
+        out["median_relative_u"] = float(np.median(samples.u_f_r[take] / samples.f_r[take]))
+    return out
+
+
+def reciprocity_of(samples: BRDFSamples) -> dict[str, Any]:
+    """Pairs of samples with swapped directions (turned about the normal), and how much they differ."""
+    from scipy.spatial import cKDTree
+
+    relative = samples.phi_r - samples.phi_i
+    key = np.stack((samples.theta_i, samples.theta_r, np.cos(relative)), axis=-1)
+    swapped = key[:, [1, 0, 2]]
+    other = np.abs(samples.theta_i - samples.theta_r) > 10 * SAME
+    if not np.any(other):
+        return {"reciprocal_pairs": 0}
+    distance, index = cKDTree(key).query(swapped[other])
+    near = distance < SAME
+    first, second = samples.f_r[other][near], samples.f_r[index[near]]
+    out: dict[str, Any] = {"reciprocal_pairs": int(np.count_nonzero(near)) // 2}
+    mean = 0.5 * (np.abs(first) + np.abs(second))
+    if np.any(mean > 0):
+        skew = np.abs(first - second)[mean > 0] / mean[mean > 0]
+        out |= {"reciprocity_rms": float(np.sqrt(np.mean(skew**2))), "reciprocity_largest": float(skew.max())}
+    return out
+
+
+def energy_of(data: BRDFSamples | TabulatedBRDF) -> dict[str, Any]:
+    """Directional albedo of the table, or of a table made from the samples; says why where there is none."""
+    try:
+        if isinstance(data, TabulatedBRDF):
+            table = data
+        else:
+            take = np.random.default_rng(0).permutation(len(data))[:MOST]
+            table = tabulate(data.select(np.sort(take)), shape=(24, 16, 8))
+        brdf = table.brdf()
+        albedo = [float(directional_albedo(brdf, np.radians(a), rtol=1e-3).value) for a in ALBEDO_DEG]
+    except (DatasetError, IntegrationError) as error:
+        return {"energy": f"not known: {error}"}
+    out: dict[str, Any] = {"albedo_deg": list(ALBEDO_DEG), "albedo": albedo}
+    worst = max(albedo)
+    out["energy"] = "conserved" if worst <= 1.0 else f"NOT conserved: an albedo of {worst:.4g} is above 1"
+    return out
