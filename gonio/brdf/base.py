@@ -108,6 +108,8 @@ class Model:
         ``(p, omega_r (..., 3)) -> (..., k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which
         f_r or a derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels
         there. A plane that one omega_r does not have is out of reach: d = 2. A user's own function takes one omega_r.
+    bent : bool
+        A derivative jumps elsewhere too, not at planes: only cells that are halved until they agree will do.
     features : callable, optional
         ``(p, omega_r (3,)) -> (k, 4)``: narrow structures elsewhere than at the mirror direction, as a function of omega_i
         for the given omega_r: rows of a unit vector and a half width [rad], such as an opposition peak's.
@@ -137,6 +139,7 @@ class Model:
     lobe_width: Callable[[Array], float] | None = None
     layer_width: Callable[[Array], float] | None = None
     kinks: Callable[[Array, Array], Array] | None = None
+    bent: bool = False
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None
     derived_slopes: Callable[[Array], Array] | None = None
@@ -212,8 +215,9 @@ class Term:
 
     @property
     def mirror_only(self) -> bool:
-        """Compiled, isotropic and without narrow structures elsewhere than at the mirror direction."""
-        return self.model.function is not None and self.model.isotropic and len(self.features(_SLANTED)) == 0
+        """Compiled, isotropic, without narrow structures elsewhere than at the mirror direction and unknown bends."""
+        model = self.model
+        return model.function is not None and model.isotropic and not model.bent and len(self.features(_SLANTED)) == 0
 
     def features(self, omega_r: Array) -> Array:
         """Narrow structures elsewhere than at the mirror: rows of a unit vector and a half width [rad], shape (k, 4)."""

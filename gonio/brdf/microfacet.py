@@ -115,7 +115,7 @@ def _function(distribution: str, fresnel: str, shadowing: str, repeated: bool) -
 def _kinks(p: Array, omega_r: Array) -> Array:
     """Of v-grooves, where the less elevated direction changes and where its grooves begin to hide nothing.
 
-    The border for omega_i as the lower direction is no plane; the integrator finds that one by itself.
+    The border for omega_i as the lower direction is no plane: the model is `bent`.
     """
     mu = omega_r[..., 2]
     planes = np.zeros((*mu.shape, 2, 4))
@@ -172,6 +172,7 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
         ),
         lobe_width=lambda p: facets.width(p[1 : 1 + shape]),
         kinks=_kinks if shadowing == "v_groove" else None,
+        bent=shadowing == "v_groove",
         derived=derived if facets.count or repeated else None,
         choices={} if name != "microfacet" else {k: v for k, v in chosen.items() if v != CHOICES[k][0]},
     )  # fmt: skip
