@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from gonio.brdf.base import Term
 from gonio.integrate import threads
 from gonio.integrate.quadrature import Effort
-from gonio.integrate.ring_kernel import gauss_table, ring_kernel
+from gonio.integrate.ring_kernel import ring_kernel
+from gonio.integrate.ring_nodes import gauss_table
 from gonio.integrate.spectrum import Spectrum
 
 Array = NDArray[np.float64]
@@ -41,20 +42,22 @@ class Scene:
         return -math.inf if self.overshoots else 0.0
 
     def sums(self, tau: Array, digits: float, waves: int) -> Array:
-        """A_m, B_m and the size of K_m for slopes tan(theta_n / 2), shape (n, 3, waves)."""
+        """What `ring_kernel` gives for slopes tan(theta_n / 2), shape (n, 3, waves), to a number of digits."""
         slopes = np.stack(((1.0 - tau) * (1.0 + tau), 2.0 * tau), axis=1) / (1.0 + tau * tau)[:, None]
         layers = self._layers(slopes[:, 0])
         planes = self._planes(slopes)
         out = np.zeros((len(tau), 3, waves))
         x, w = gauss_table()
         kernel: Any = ring_kernel(self.term.model.function)
-        used, bent, error = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1)
+        needed = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1)
+        edges, detail = (self.rings.breaks, np.zeros(1)) if self.rows else self.rings.groups
 
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
-                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], planes[tile], self.rings.breaks,
-                self.rings.series, used, bent, error, self.rows, digits * math.log(10.0), x, w, out[tile], effort,
+                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], planes[tile], edges, detail,
+                self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows, digits * math.log(10.0), x, w,
+                out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
 
@@ -82,8 +85,8 @@ class Scene:
 
 
 def first_digits(rtol: float) -> float:
-    """Digits to begin with, of the largest value at a slope: one more than asked for, as most azimuths are darker."""
-    return min(MOST_DIGITS, max(2.0, 0.5 - math.log10(rtol)))
+    """Digits to begin with, of the largest value at a slope: smooth fields give three more than asked for."""
+    return min(MOST_DIGITS - 2.0, max(2.0, -2.0 - math.log10(rtol)))
 
 
 def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:
@@ -99,8 +102,8 @@ def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:
 def tail_of(sums: Array, rings: Spectrum) -> Array:
     """What waves beyond the last may add at any azimuth, shape (n,).
 
-    The field's own waves, all of them known, times how much of the last ones came through: the share that a BRDF lets
-    through falls with m. Of two groups of last waves the larger share is taken twice.
+    The field's own waves, all of them known, times how much of the last ones came through. This share, what a BRDF lets
+    through of a wave, falls with m at least as 1/m: K is continuous. Of two groups of last waves the larger is taken twice.
     """
     waves = sums.shape[2]
     if rings.beyond[waves] == 0.0:
@@ -109,7 +112,7 @@ def tail_of(sums: Array, rings: Spectrum) -> Array:
     for first, last in ((3 * waves // 4, 7 * waves // 8), (7 * waves // 8, waves)):
         given = max(rings.beyond[first] - rings.beyond[last], 1e-3 * rings.beyond[waves], 1e-300)
         share = np.maximum(share, truncated(sums[..., :last], first) / given)
-    tail: Array = np.minimum(2.0 * share, sums[:, 2, 0]) * rings.beyond[waves]
+    tail: Array = np.minimum(2.0 * share * waves * rings.falling[waves], sums[:, 2, 0] * rings.beyond[waves])
     return tail
 
 

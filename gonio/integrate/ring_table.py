@@ -24,6 +24,9 @@ _SAFETY = 3.0
 _MOST_PIECES = 200
 _DEEPEST = 24
 _TO_LIMB = 4.0  # by which a piece may come nearer to the limb than it began
+_WAVES_IN_PIECE = 8.0  # length of a piece times waves
+_NOISE = 0.1  # of the tolerance, for the quadrature
+_SOME = [1, 2]  # probes of which the noise is measured
 _PATCHING = 0.05  # of the tolerance, for reading between the nodes
 
 
@@ -31,7 +34,7 @@ _PATCHING = 0.05  # of the tolerance, for reading between the nodes
 def _chebyshev() -> tuple[Array, Array, Array]:
     """Nodes and probes in [-1, 1], and the matrix from values at the nodes to coefficients."""
     nodes: Array = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
-    probes: Array = np.cos(np.pi * np.array([1, 3, 6, 9, 12, 15]) / (_DEGREE + 1))  # half way between nodes
+    probes: Array = np.cos(np.pi * np.array([1, 6, 11, 15]) / (_DEGREE + 1))  # half way between nodes
     matrix = np.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, _DEGREE)), dtype=np.float64)
     return nodes, probes, matrix
 
@@ -79,14 +82,9 @@ def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
     """
     lowest = room.lowest
     highest = max(room.highest, lowest * (1.0 + 1e-12) + 1e-300)
-    digits = first_digits(rtol)
-    waves, scale = _waves(scene, lowest, highest, digits, rtol, room)
-    scale = max(scale, room.largest)
-    count = max(1, math.ceil((highest - lowest) * min(waves, 64) / 9.0))
-    edges = np.linspace(lowest, highest, count + 1).tolist()
-    while 1.0 - edges[-2] > _TO_LIMB * (1.0 - highest) and highest < 1.0:  # seen along the surface, R may be singular
-        edges.insert(-1, 1.0 - max((1.0 - edges[-2]) / _TO_LIMB, (1.0 - highest) * 1.0001))
-    pending = [_Piece(float(a), float(b), digits, waves) for a, b in itertools.pairwise(edges)]
+    survey = _survey(scene, lowest, highest, rtol, room)
+    scale = max(survey.scale, room.largest)
+    pending = [_Piece(a, b, *survey.around(a, b)) for a, b in itertools.pairwise(survey.edges(lowest, highest))]
     done: list[tuple[_Piece, _Trial]] = []
     while pending:
         first = pending[0]
@@ -103,7 +101,7 @@ def tabulate(scene: Scene, rtol: float, room: Room) -> Table:
                 continue
             better = replace(
                 piece,
-                digits=min(MOST_DIGITS, piece.digits + math.ceil(trial.digits_short)),
+                digits=min(MOST_DIGITS, piece.digits + trial.digits_short),
                 waves=min(scene.rings.waves, math.ceil(1.5 * piece.waves)) if trial.waves_short else piece.waves,
                 depth=piece.depth + 1,
                 error=trial.error,
@@ -128,8 +126,10 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
     at_nodes = np.array([_within(piece, nodes) for piece in pieces])
     at_probes = np.array([_within(piece, probes) for piece in pieces])
     all_nodal = scene.sums(at_nodes.ravel(), digits, waves).reshape(len(pieces), len(nodes), 3, waves)
-    more = min(scene.rings.waves, max(waves + max(8, waves // 3), scene.first_waves if scene.rows else 0))
+    more = _more(scene, waves)
     all_fine = scene.sums(at_probes.ravel(), digits + 1.0, more).reshape(len(pieces), len(probes), 3, more)
+    some = np.ascontiguousarray(at_probes[:, _SOME])
+    all_rough = scene.sums(some.ravel(), digits, waves).reshape(len(pieces), len(_SOME), 3, waves)
     between = np.polynomial.chebyshev.chebvander(probes, _DEGREE)
     columns = 1 << max(5, math.ceil(math.log2(8 * waves)))
     trials = []
@@ -140,21 +140,24 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
         missed = float(np.max(np.abs(on_azimuths(np.tensordot(between, series, axes=1), columns, 0.5) - exact)))
         if scene.rows:  # the series converges slowly where the horizon or the lobe crosses rows: doubt more than the probes
             missed = max(missed, 0.5 * float(np.max(np.sum(np.abs(on_azimuths(series[-3:], columns)), axis=0))))
+        noise = float(np.max(np.abs(on_azimuths(fine[_SOME, :, :waves] - all_rough[k], columns))))
         lost, tail = float(np.max(truncated(fine, waves))), float(np.max(tail_of(fine, scene.rings)))
         floor = max(floor_of(scene, sums) for sums in fine)
-        error = _SAFETY * missed + floor + tail
+        cut = float(np.max(fine[:, 2, 2]))
+        error = _SAFETY * missed + floor + cut + tail
         smallest = min(float(np.abs(exact).min()), float(np.abs(on_azimuths(nodal, columns)).min()))
         allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), 5.0 * floor, resolution)
-        noise = 10.0**-digits * float(np.abs(exact).max())
+        noise = max(noise, cut)
+        noisy = noise > _NOISE * allowed and digits < MOST_DIGITS
         trials.append(
             _Trial(
                 series,
                 error,
                 allowed,
                 error <= (1.0 - _PATCHING) * allowed,
-                math.log10(max(0.3 * noise / allowed, 1.0)),
+                max(1.0, min(3.0, math.ceil(math.log10(3.0 * noise / allowed)))) if noisy else 0.0,
                 lost + tail > 0.2 * allowed and waves < scene.rings.waves,
-                missed > max(noise, 2.0 * lost),
+                missed > 4.0 * max(noise, lost),
             )
         )
     return trials
@@ -164,19 +167,69 @@ def _within(piece: _Piece, x: Array) -> Array:
     return piece.lower + (piece.upper - piece.lower) * (x + 1.0) / 2.0
 
 
-def _waves(scene: Scene, lowest: float, highest: float, digits: float, rtol: float, room: Room) -> tuple[int, float]:
-    """How many waves R has, from a few slopes, and its largest value there."""
+def _more(scene: Scene, waves: int) -> int:
+    """Waves of the sums that others with fewer are compared with."""
+    return min(scene.rings.waves, waves + max(8, waves // 3))
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What a few slopes tell: digits (n,) and waves (n,) that sums take there, and the largest value."""
+
+    at: Array
+    digits: Array
+    waves: NDArray[np.int64]
+    scale: float
+
+    def around(self, lower: float, upper: float) -> tuple[float, int]:
+        """Digits and waves for an interval: the most of those inside and next to it."""
+        first = max(0, int(np.searchsorted(self.at, lower, side="right")) - 1)
+        last = min(len(self.at), int(np.searchsorted(self.at, upper)) + 1)
+        return float(self.digits[first:last].max()), int(self.waves[first:last].max())
+
+
+    def edges(self, lower: float, upper: float) -> list[float]:
+        """Intervals on which so many waves should be polynomials: R turns with the mirror direction, 4 atan(tau).
+
+        Seen along the surface R may be singular: an interval comes nearer to the limb by a factor at most.
+        """
+        edges = [lower]
+        while edges[-1] < upper:
+            a = edges[-1]
+            long = _WAVES_IN_PIECE * (1.0 + a * a)
+            waves = self.around(a, a + long / self.around(a, a)[1])[1]
+            b = min(upper, a + long / waves)
+            edges.append(min(b, 1.0 - (1.0 - a) / _TO_LIMB) if upper < 1.0 else b)
+        return edges
+
+
+def _survey(scene: Scene, lowest: float, highest: float, rtol: float, room: Room) -> _Survey:
     at = lowest + (highest - lowest) * np.array([0.02, 0.2, 0.4, 0.6, 0.8, 0.98])
     spare = np.array([room.smallest(t, t) for t in at])
-    waves = min(scene.rings.waves, scene.first_waves)
+    most = min(scene.rings.waves, scene.first_waves)
+    digits = np.full(len(at), first_digits(rtol))
+    sums = scene.sums(at, digits[0], most)
+    pending = np.arange(len(at))
     while True:
-        sums = scene.sums(at, digits, waves)
-        values = np.abs(on_azimuths(sums, 4 * waves))
-        wanted = 0.1 * np.maximum(np.maximum(rtol * values.min(axis=1), spare), 1e-14 * values.max())
-        if waves >= scene.rings.waves or np.all(tail_of(sums, scene.rings) <= wanted):
+        level = float(digits[pending[0]]) + 1.0
+        finer = scene.sums(at[pending], level, most)
+        values = np.abs(on_azimuths(finer, 4 * most))
+        wanted = np.maximum(np.maximum(rtol * values.min(axis=1), spare[pending]), 1e-14 * values.max())
+        noise = np.abs(on_azimuths(finer - sums[pending], 4 * most)).max(axis=1)
+        sums[pending] = finer
+        again = np.maximum(noise, finer[:, 2, 2]) > _NOISE * wanted
+        pending = pending[again]
+        if not pending.size or level >= MOST_DIGITS - 1.0:
             break
-        waves = min(scene.rings.waves, 2 * waves)
-    for fewer in range(8, waves, 4):
-        if np.all(truncated(sums, fewer) + tail_of(sums, scene.rings) <= wanted):
-            return fewer + 2, float(values.max())
-    return waves, float(values.max())
+        digits[pending] += 1.0
+    values = np.abs(on_azimuths(sums, 4 * most))
+    wanted = 0.1 * np.maximum(np.maximum(rtol * values.min(axis=1), spare), 1e-14 * values.max())
+    while most < scene.rings.waves and np.any(tail_of(sums, scene.rings) > wanted):
+        most = min(scene.rings.waves, 2 * most)
+        sums = scene.sums(at, float(digits.max()) + 1.0, most)
+    waves = np.full(len(at), most)
+    for fewer in range(most - 1, 7, -4):
+        tail = tail_of(sums[..., : _more(scene, fewer)], scene.rings)
+        enough = (truncated(sums, fewer) + tail <= wanted) & (waves <= fewer + 4)
+        waves[enough] = fewer
+    return _Survey(at, digits, np.minimum(waves + 2, scene.rings.waves), float(values.max()))

@@ -103,7 +103,7 @@ def _directly(
         for j, k in enumerate(pending):
             here = np.flatnonzero(where == k)
             value[here] = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
-            error[here] = _SHARE * step[j] + tail[j] + floor_of(scene, fine[j])
+            error[here] = _SHARE * step[j] + tail[j] + float(fine[j, 2, 2]) + floor_of(scene, fine[j])
             again[j] = np.any(error[here] > np.maximum(rtol * np.abs(value[here]), atol[here]))
         if not np.any(again):
             return value, error

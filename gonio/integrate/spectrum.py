@@ -18,6 +18,7 @@ import functools
 import itertools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,25 @@ _DEGREE = 11
 _LARGEST = 1 << 14  # azimuths of a ring
 _DEEPEST = 20  # halvings of a panel
 _MAP_WAVES = 1024  # waves kept of a map, or four times its columns
+
+
+class Needed(NamedTuple):
+    """What sums over rings to a number of digits take of a `Spectrum`, for each panel.
+
+    Attributes
+    ----------
+    used, bent : ndarray of int, shape (p,)
+        Waves that matter; waves that matter where a ring is cut.
+    rest : ndarray, shape (2, p)
+        Nodes beyond m l / 4 that the series of each take on an interval of length l, over l^(1/3).
+    cut : ndarray, shape (p,)
+        Bound of the waves beyond [W m^-2 sr^-1].
+    """
+
+    used: NDArray[np.int64]
+    bent: NDArray[np.int64]
+    rest: Array
+    cut: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +71,8 @@ class Spectrum:
         Largest error of the radiance on a panel, truncation apart for maps [W m^-2 sr^-1].
     beyond : ndarray, shape (waves + 1,)
         Bound of the sum of all waves from m on, at any theta, also those that are not kept [W m^-2 sr^-1].
+    falling : ndarray, shape (waves + 1,)
+        The same of each wave divided by its m.
     """
 
     breaks: Array
@@ -58,22 +80,54 @@ class Spectrum:
     size: Array
     error: Array
     beyond: Array
+    falling: Array
 
     @property
     def waves(self) -> int:
         """Number of terms of the Fourier series, m = 0 to waves - 1."""
         return int(self.series.shape[3])
 
+    @functools.cached_property
+    def groups(self) -> tuple[Array, Array]:
+        """Edges (n + 1,) of runs of panels of like length, and the inverse of the shortest length in each (n,) [1/rad]."""
+        lengths = np.diff(self.breaks)
+        first = [0]
+        for k in range(1, len(lengths)):
+            run = lengths[first[-1] : k + 1]
+            if run.max() > 2.5 * run.min():
+                first.append(k)
+        return np.append(self.breaks[first], self.breaks[-1]), 1.0 / np.minimum.reduceat(lengths, first)
+
     @functools.lru_cache(maxsize=8)  # noqa: B019 - spectra are few, and kept by `spectrum` anyway
-    def needed(self, digits: float, power: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """For each panel: how many waves matter, how many of them divided by m^power, and the error with the former."""
-        negligible = 0.1 * 10.0**-digits * self.size.sum(axis=1)
-        remaining = np.cumsum(self.size[:, ::-1], axis=1)[:, ::-1]
-        used = np.maximum(1, (remaining > negligible[:, None]).sum(axis=1))
-        cut = np.where(used < self.waves, remaining[np.arange(len(used)), np.minimum(used, self.waves - 1)], 0.0)
+    def needed(self, digits: float, power: int) -> Needed:
+        """What sums to so many digits take of it; integrals over rings that are cut fall as m^-power."""
+        nats = digits * math.log(10.0)
+        total = self.size.sum(axis=1)
+        negligible = 0.03 * 10.0**-digits * total
         weak = self.size / np.maximum(1.0, np.arange(self.waves)) ** power
-        bent = (np.cumsum(weak[:, ::-1], axis=1)[:, ::-1] > 30.0 * negligible[:, None]).sum(axis=1)
-        return used.astype(np.int64), bent.astype(np.int64), self.error + cut
+        remaining, remaining_weak = (np.cumsum(x[:, ::-1], axis=1)[:, ::-1] for x in (self.size, weak))
+        used = np.maximum(1, (remaining > negligible[:, None]).sum(axis=1))
+        bent = (remaining_weak > 100.0 * negligible[:, None]).sum(axis=1)
+        cut = np.where(used < self.waves, remaining[np.arange(len(used)), np.minimum(used, self.waves - 1)], 0.0)
+        relative = 1.0 / np.maximum(total, 1e-300)[:, None]
+        rest = [_rest(relative * r, n, nats) for r, n in ((remaining, used), (remaining_weak, bent))]
+        return Needed(used.astype(np.int64), bent.astype(np.int64), np.array(rest), cut)
+
+
+def _rest(remaining: Array, count: NDArray[np.intp], nats: float) -> Array:
+    """Nodes beyond m l / 4 for the last of `count` waves, over l^(1/3), that are enough for the others too, shape (panels,).
+
+    The series of wave m on an interval of length l has died to d natural digits at the degree 2 q = z + (d^2 z)^(1/3),
+    z = m l / 2, where Bessel's J has; a wave that is weak needs fewer digits.
+    """
+    m = np.unique(np.geomspace(1, max(1, remaining.shape[1] - 1), 24).astype(np.intp))
+    length = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
+    digits = np.clip(nats + np.log(np.maximum(remaining[:, m], 1e-300)), 0.0, nats)
+    digits[m >= count[:, None]] = 0.0
+    z = 0.5 * np.minimum(m, np.maximum(count - 1, 0)[:, None])[..., None] * length  # (panels, waves, lengths)
+    beyond = z + np.cbrt(digits[..., None] ** 2 * z) - 0.5 * np.maximum(count - 1, 0)[:, None, None] * length
+    rest: Array = 0.5 * np.max(beyond / np.cbrt(length), axis=(1, 2), initial=0.0)
+    return rest
 
 
 @functools.lru_cache(maxsize=16)
@@ -131,12 +185,17 @@ def _of_map(field: EnvironmentMap, tolerance: float) -> Spectrum:
     error = 8 * EPS * np.maximum(size.sum(axis=1), scale)
     # what is not kept falls as 1/m^2 (smooth: 1/m^4), period by period of the columns
     rest = 1.1 * waves * float(np.mean(size.max(axis=0)[-n_phi:]))
-    return Spectrum(breaks, np.ascontiguousarray(series), size, error, _beyond(size, rest))
+    return Spectrum(breaks, np.ascontiguousarray(series), size, error, *_beyond(size, rest))
 
 
-def _beyond(size: Array, rest: float) -> Array:
-    """Sums of the largest waves from m on, and `rest`."""
-    return np.concatenate((np.cumsum(size.max(axis=0)[::-1])[::-1], [0.0])) + rest
+def _beyond(size: Array, rest: float) -> tuple[Array, Array]:
+    """Sums of the largest waves from m on, and `rest`; and the same of waves over m."""
+    waves = size.shape[1]
+    largest, falling = size.max(axis=0), size.max(axis=0) / np.maximum(1.0, np.arange(waves))
+    return (
+        np.concatenate((np.cumsum(largest[::-1])[::-1], [0.0])) + rest,
+        np.concatenate((np.cumsum(falling[::-1])[::-1], [0.0])) + rest / waves,
+    )
 
 
 def _first_breaks(field: Field) -> list[float]:
@@ -197,10 +256,10 @@ def _of_samples(field: Field, tolerance: float) -> Spectrum:
     table[..., 1:] *= 2.0
     negligible = 0.1 * tolerance * scale
     size = np.hypot(*np.moveaxis(np.abs(table).sum(axis=1), 1, 0))
-    waves = max(2, int((np.cumsum(size[:, ::-1], axis=1)[:, ::-1] > negligible).sum(axis=1).max()))
+    waves = max(3, int((np.cumsum(size[:, ::-1], axis=1)[:, ::-1] > negligible).sum(axis=1).max()))
     error = np.array([e for *_, e in done]) + size[:, waves:].sum(axis=1) + 8.0 * EPS * scale
     table, size = np.ascontiguousarray(table[..., :waves]), np.ascontiguousarray(size[:, :waves])
-    return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, size, error, _beyond(size, 0.0))
+    return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, size, error, *_beyond(size, 0.0))
 
 
 def _grid(theta: Array, azimuths: int) -> Array:
