@@ -64,7 +64,7 @@ def read(path: Path) -> Contents:
     if "refused" in header:
         raise DatasetError(f"{path}: {files.shown(header['refused'], 200)[1:-1]}")
     if "damaged" in header:
-        raise DatasetError(f"{path} is a damaged NetCDF-4 file ({files.shown(header['damaged'], 120)}); make it again")
+        raise DatasetError(f"{path} is a damaged NetCDF-4 file ({files.shown(header['damaged'], 220)}); make it again")
     arrays, texts, others, attributes = {}, {}, {}, {"": header["attributes"]}
     at = 0
     for name, variable in header["variables"].items():

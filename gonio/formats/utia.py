@@ -42,9 +42,8 @@ def read(path: Path) -> ChannelSamples:
     data = np.frombuffer(files.read_bytes(path), dtype="<f8").astype(float)
     bad = ~np.isfinite(data) | (np.abs(data) > LARGEST)
     if np.any(bad):
-        raise DatasetError(
-            f"{path}: value {int(np.argmax(bad))} of {data.size} is no sRGB-encoded reflectance; it is damaged"
-        )
+        at = int(np.argmax(bad))
+        raise DatasetError(f"{path}: value {at} of {data.size} ({data[at]:g}) is no sRGB-encoded reflectance; it is damaged")
     encoded = data.reshape(3, SIDE * SIDE).T
     linear = np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)
     missing = encoded < 0
