@@ -37,7 +37,7 @@ from gonio.brdf.pieces import read as read_pieces
 
 Array = NDArray[np.float64]
 _NEAR = 1e-8  # in alphas: cosines below are near the horizon
-_LOW = 1e-6  # in alphas: slopes below are none
+_LOW = 1e-8  # in alphas: slopes below are none
 _PANEL = 1.5  # longest panel in ln tan(theta_h / 2)
 
 
@@ -130,7 +130,7 @@ def rules(pointed: bool) -> tuple[Array, Array, Array]:
     """Along rings; for panels of theta_h with an edge, and without."""
     both = tanh_sinh(0.07)
     whole = np.stack((np.where(both[0] < 0, -both[0], 1.0 - both[0]), both[1]))
-    return whole if pointed else even(), tanh_sinh(0.05 if pointed else 0.075), gauss()
+    return whole if pointed else even(), tanh_sinh(0.05), gauss()
 
 
 @functools.cache
