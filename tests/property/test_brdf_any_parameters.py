@@ -59,7 +59,7 @@ def test_gate_any_parameters() -> None:
     microfacets = [(c.name, dict(c.choices)) for c in MICROFACETS]
     slow = [m for m in microfacets if m[1]["distribution"] == "gtr"]
     quick = [*MODELS, *(m for m in microfacets if m not in slow)]
-    counts = [(m, 500) for m in slow] + [(m, 25) for m in REPEATED]
+    counts = [(m, 100) for m in slow] + [(m, 10) for m in REPEATED]
     each = -(-(GATE_TOTAL - sum(n for _, n in counts)) // len(quick))
     counts += [(m, each) for m in quick]
     for k, (model, count) in enumerate(counts):

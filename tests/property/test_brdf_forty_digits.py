@@ -2,12 +2,13 @@
 
 Directions: 0, 1e-8 and 0.3 rad to 89.99 degrees, exact mirror, exact retro-reflection, and 1e-8 and 1e-4 rad beside them. CI
 takes each special value of a parameter among ordinary ones, and the microfacet models by 16 sets of choices in which each
-pair occurs; the gate takes all combinations of values and of choices, in all directions.
+pair occurs; the gate takes all combinations of values (of Hapke's every seventh) and of choices, in all directions.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -58,10 +59,10 @@ def test_gate_forty_digits_everywhere(group: str) -> None:
     cases = PLAIN if group == "plain" else (*SHORTS, *MICROFACETS)
     worst, count = (0.0, cases[0]), 0
     for case in cases:
-        sets: list[dict[str, Any]] = list(itertools.chain(case.one_at_a_time(), case.all_together()))
-        thin = 1 if len(sets) < 1000 else 12
+        every = 1 if math.prod(map(len, case.values.values())) < 1000 else 7  # of Hapke's 1944
+        sets: list[dict[str, Any]] = [*case.one_at_a_time(), *itertools.islice(case.all_together(), 0, None, every)]
         count += len(sets)
-        worst = max(worst, (compare(case.name, case.formula, sets, thin=thin, digits=DIGITS), case), key=lambda w: w[0])
+        worst = max(worst, (compare(case.name, case.formula, sets, digits=DIGITS), case), key=lambda w: w[0])
     assert worst[0] <= LIMIT
     record(
         f"BRDF models at {DIGITS} digits, {group}",
