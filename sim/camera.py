@@ -54,6 +54,8 @@ class SimulatedCamera:
         ``"torn"`` or ``"repeated"``: what is wrong with the next frame.
     log : deque of dict
         What was true at the middle of each exposure, with its label; the latest 100 000.
+    record : callable or None
+        Gets each entry of the log as well.
     """
 
     def __init__(self, world: World, clock: Clock, before_exposure: Callable[[str], None] | None = None) -> None:
@@ -62,6 +64,7 @@ class SimulatedCamera:
         self.unplugged = False
         self.spoil: str | None = None
         self.log: deque[dict[str, Any]] = deque(maxlen=100_000)
+        self.record: Callable[[dict[str, Any]], None] | None = None
         self._clock = clock
         self._before_exposure = before_exposure
         self.chip = Chip(world.settings.sensor, world.settings.seed)
@@ -141,12 +144,15 @@ class SimulatedCamera:
         noise = generator(self.world.settings.seed, "frame", label)
         image = self.chip.expose(self.rate(t), exposure_s, noise, gain)
         self.frames += 1
-        self.log.append({"label": label, "exposure_s": exposure_s, **self.world.state(t)})
+        entry = {"label": label, "exposure_s": exposure_s, **self.world.state(t)}
+        self.log.append(entry)
+        if self.record is not None:
+            self.record(entry)
         before, self._previous = self._previous, image
         spoil, self.spoil = self.spoil, None
         if spoil is not None and before is not None:
-            torn = len(image) if spoil == "repeated" else len(image) // 2
-            image = np.concatenate((before[:torn], image[torn:]))
+            fresh = 0 if spoil == "repeated" else len(image) // 2
+            image = np.concatenate((image[:fresh], before[fresh:]))
         return image
 
     def finish(self, data: NDArray[np.uint16], exposure_s: float, label: str) -> Frame:

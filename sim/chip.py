@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from sim.settings import Sensor
-from sim.world import generator
+from sim.truth import generator
 
 Array = NDArray[np.float64]
 _FEW = 30.0  # electrons: above, a normal shot noise lacks less than a fifth in its skew
@@ -40,6 +40,8 @@ class Chip:
     ----------
     rays : ndarray, shape (height * width, 3)
         Unit vectors into which the pixels look from `eye` [mm].
+    shape : tuple of int
+        (height, width).
     gamma : float
         Of the converter's curve; 0 for a linear one.
     """
@@ -60,7 +62,7 @@ class Chip:
         corner = float(np.hypot(x[0], y[0]))
         fall_off *= 1.0 - sensor.vignetting * (np.hypot(x, y[:, None]) / corner) ** 2
         self._fall_off = sensor.responsivity * fall_off
-        shape = (sensor.height, sensor.width)
+        self.shape = shape = (sensor.height, sensor.width)
         self._gains = np.ones(shape)
         if sensor.prnu > 0.0:
             self._gains += sensor.prnu * generator(seed, "prnu").standard_normal(shape)

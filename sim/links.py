@@ -4,8 +4,9 @@ A device is anything with ``feed(data, t) -> [(delay, reply), ...]`` and ``idle(
 links run on a `ScaledClock`, have file descriptors and never block; `Pump` is the loop that drives them, together with
 any other object of the same shape (`Link`).
 
-They do not pace bytes: a reply leaves when its delay is over, in scaled time, and all at once. Pseudo-terminals need a
-Unix; nothing else here does. For a device inside the same process see `sim.port`.
+A reply leaves when its delay is over, in scaled time, and all at once; with a baud rate it leaves when its last byte would
+have come over a line of that speed, after the bytes that asked for it. Pseudo-terminals need a Unix; nothing else here
+does. For a device inside the same process see `sim.port`.
 """
 
 from __future__ import annotations
@@ -97,9 +98,16 @@ class Pump:
             due = link.due()
             if due is not None and due <= now:
                 link.on_due()
-            if link.closed:
+            if link.closed and link in self._links:
                 self._forget(link)
                 link.close()
+
+    def drop(self, link: Link) -> None:
+        """Close a link, and what came of it, and drive it no longer."""
+        for one in list(self._links):
+            if one is link or getattr(one, "parent", None) is link:
+                self._forget(one)
+                one.close()
 
     def run(self, stop: Callable[[], bool], poll_s: float = 0.05) -> None:
         """Step until `stop` says so."""
@@ -123,9 +131,11 @@ class Pump:
 class _StreamLink:
     """A device behind a descriptor, with a queue of replies that are not due yet."""
 
-    def __init__(self, device: Device, clock: ScaledClock) -> None:
+    def __init__(self, device: Device, clock: ScaledClock, baud: int | None = None) -> None:
         self._device = device
         self._clock = clock
+        self._baud = baud
+        self._free = 0.0  # when the line has carried everything so far; 10 bits a byte
         self._queue: deque[tuple[float, bytes]] = deque()
         self._unsent = b""
         self._retry = 0.0  # when to try again what the receiver did not take
@@ -148,9 +158,13 @@ class _StreamLink:
         if now - self._heard > IDLE_S:
             self._device.idle()
         self._heard = now
-        for delay, reply in self._device.feed(data, self._clock.now()):
+        speed = self._clock.speed
+        byte_s = 10.0 / self._baud / speed if self._baud else 0.0
+        self._free = max(self._free, now) + len(data) * byte_s
+        for delay, reply in self._device.feed(data, self._clock.now() + (self._free - now) * speed):
             last = self._queue[-1][0] if self._queue else now
-            self._queue.append((max(last, now + delay / self._clock.speed), reply))
+            self._free = max(last, self._free + delay / speed if self._baud else now + delay / speed) + len(reply) * byte_s
+            self._queue.append((self._free, reply))
         self.on_due()
 
     def _flush(self) -> None:
@@ -181,6 +195,8 @@ class PtyLink(_StreamLink):
     clock : ScaledClock
     symlink : path, optional
         A stable name for the terminal, made anew if it is a left-over link.
+    baud : int, optional
+        Pace of the bytes [bit/s], where the client sets none; as fast as they come by default.
 
     Attributes
     ----------
@@ -193,8 +209,10 @@ class PtyLink(_StreamLink):
         If this system has no pseudo-terminals, or `symlink` is something that is not a link.
     """
 
-    def __init__(self, device: Device, clock: ScaledClock, symlink: str | Path | None = None) -> None:
-        super().__init__(device, clock)
+    def __init__(
+        self, device: Device, clock: ScaledClock, symlink: str | Path | None = None, baud: int | None = None
+    ) -> None:
+        super().__init__(device, clock, baud)
         try:
             import pty
             import tty
@@ -232,8 +250,11 @@ class PtyLink(_StreamLink):
             self.closed = True
             return ()
         if data:
+            rate = _line_rate(self._slave)
             if hasattr(self._device, "baudrate"):
-                self._device.baudrate = _line_rate(self._slave)
+                self._device.baudrate = rate
+            if self._baud and rate:
+                self._baud = rate
             self._receive(data)
         return ()
 
@@ -256,8 +277,9 @@ class PtyLink(_StreamLink):
 class _Connection(_StreamLink):
     """One client of a `TcpLink`."""
 
-    def __init__(self, device: Device, clock: ScaledClock, client: socket.socket) -> None:
-        super().__init__(device, clock)
+    def __init__(self, device: Device, clock: ScaledClock, client: socket.socket, baud: int | None) -> None:
+        super().__init__(device, clock, baud)
+        self.parent: TcpLink | None = None
         self._socket = client
 
     def fileno(self) -> int:
@@ -298,6 +320,8 @@ class TcpLink:
     host : str, optional
     port : int, optional
         0 for any free one.
+    baud : int, optional
+        Pace of the bytes [bit/s]; as fast as they come by default.
 
     Attributes
     ----------
@@ -305,9 +329,12 @@ class TcpLink:
         Host and port.
     """
 
-    def __init__(self, device: Device, clock: ScaledClock, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, device: Device, clock: ScaledClock, host: str = "127.0.0.1", port: int = 0, baud: int | None = None
+    ) -> None:
         self._device = device
         self._clock = clock
+        self._baud = baud
         self._client: _Connection | None = None
         self.closed = False
         try:
@@ -331,7 +358,8 @@ class TcpLink:
         if self._client is not None:
             self._client.closed = True
         self._device.idle()
-        self._client = _Connection(self._device, self._clock, client)
+        self._client = _Connection(self._device, self._clock, client, self._baud)
+        self._client.parent = self
         return (self._client,)
 
     def due(self) -> float | None:

@@ -17,28 +17,31 @@ from gonio.interfaces import Clock
 from sim.links import Device
 
 POLL_S = 1e-5  # rig time that an empty read without timeout takes
+GAP_S = 1.5e-3  # silence after which a device forgets an unfinished packet
 
 
 class _Line:
     """A device under a name, and the port that has it open."""
 
-    def __init__(self, device: Device, clock: Clock) -> None:
+    def __init__(self, device: Device, clock: Clock, since: float) -> None:
         self.device = device
         self.clock = clock
+        self.since = since  # when it is plugged in [s]
+        self.heard = since  # when its last byte came [s]
         self.port: SimulatedPort | None = None
 
 
 _lines: dict[str, _Line] = {}
 
 
-def attach(name: str, device: Device, clock: Clock) -> str:
-    """Make a device reachable as ``sim://NAME`` in this process; return that URL.
+def attach(name: str, device: Device, clock: Clock, since: float = 0.0) -> str:
+    """Make a device reachable as ``sim://NAME`` in this process, from rig time `since` [s] on; return that URL.
 
     A device that was there under this name is replaced.
     """
     if "sim.urls" not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append("sim.urls")
-    _lines[name] = _Line(device, clock)
+    _lines[name] = _Line(device, clock, since)
     return f"sim://{name}"
 
 
@@ -77,7 +80,7 @@ class SimulatedPort(SerialBase):  # type: ignore[misc]  # pyserial has no types
             raise SerialException("Port is already open.")
         name = str(self._port).split("://", 1)[-1].strip("/")
         line = _lines.get(name)
-        if line is None:
+        if line is None or line.clock.now() < line.since:
             raise SerialException(f"could not open port {self._port}: no simulated device of that name")
         if line.port is not None:
             raise SerialException(f"could not open port {self._port}: it is open already")
@@ -107,8 +110,10 @@ class SimulatedPort(SerialBase):  # type: ignore[misc]  # pyserial has no types
         line = self._open_line()
         sent = bytes(data)
         byte_s = 10.0 / self._baudrate
+        if line.clock.now() - line.heard > GAP_S:
+            line.device.idle()
         line.clock.sleep(len(sent) * byte_s)
-        now = line.clock.now()
+        now = line.heard = line.clock.now()
         last = self._arriving[-1][0] if self._arriving else now
         for delay, reply in line.device.feed(sent, now):
             # The line carries one reply after the other.

@@ -3,19 +3,23 @@
 ::
 
     [[fault]]
-    kind = "silent"        # silent, overload, overheat, voltage, stuck, error_status, drop, corrupt, delay
-    axis = "pan"
+    kind = "silent"        # silent, overload, overheat, voltage, stuck, obstacle, reboot, error_status,
+    axis = "pan"           # drop, truncate, corrupt, duplicate, delay, wrong_id
     at_pose = 17
 
     [[fault]]
-    kind = "lamp_out"      # lamp_out, lamp_silent, camera_unplugged
+    kind = "lamp_out"      # lamp_out, lamp_silent, camera_unplugged, frame_torn, frame_repeated, disconnect
     after_frames = 200
 
 Each fault has one trigger. ``at_pose`` strikes when the first frame of that pose is asked for, ``after_frames`` when
-that many frames were taken and another is asked for, ``at_s`` at a rig time [s] (the lamp and the camera notice it at
-the next frame). Faults of an axis may instead have a trigger of `sim.dynamixel.faults.Fault`: ``at_goal_write``,
-``at_instruction`` or ``at_reply``, and take its options ``after_s``, ``every``, ``until_instruction``, ``number``,
-``delay_s``.
+that many frames were taken and another is asked for, ``at_s`` at a rig time [s] (in this process the lamp, the camera and
+the cables notice it at the next frame). Faults of an axis may instead have a trigger of `sim.dynamixel.faults.Fault`:
+``at_goal_write``, ``at_instruction`` or ``at_reply``, and take its options ``after_s``, ``every``, ``until_instruction``,
+``number``, ``delay_s``, ``flips``, ``burst``, ``lost_bytes``, ``ahead_counts``. Faults of answers strike every answer from
+their trigger on, unless ``every`` says otherwise; counted ones once.
+
+``disconnect`` pulls the bus's cable; with ``for_s`` it is back after that many rig seconds, under the name ``return_as``
+if there is one, as a USB adapter comes back as another ttyUSB.
 
 Nothing is left to chance, so a scan that failed fails again.
 """
@@ -29,15 +33,17 @@ from pathlib import Path
 from typing import Any
 
 from gonio.errors import ConfigurationError
-from sim.dynamixel.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD, Fault
+from sim.dynamixel.faults import INPUT_VOLTAGE, OF_REPLIES, OF_THE_SERVO, OVERHEATING, OVERLOAD, Fault
 from sim.settings import AXES, Table, read_file
 
 _HARDWARE = {"overload": OVERLOAD, "overheat": OVERHEATING, "voltage": INPUT_VOLTAGE}
-_AXIS_KINDS = ("silent", *_HARDWARE, "stuck", "error_status", "drop", "corrupt", "delay")
-_BENCH_KINDS = ("lamp_out", "lamp_silent", "camera_unplugged")
+_AXIS_KINDS = ("silent", *_HARDWARE, "stuck", "obstacle", "reboot", "error_status", *OF_REPLIES)
+_BENCH_KINDS = ("lamp_out", "lamp_silent", "camera_unplugged", "frame_torn", "frame_repeated", "disconnect")
 _FRAME_TRIGGERS = ("at_pose", "after_frames")
 _BUS_TRIGGERS = ("at_goal_write", "at_instruction", "at_reply")
-_OPTIONS = ("after_s", "every", "until_instruction", "number", "delay_s")
+_WHOLE = ("every", "until_instruction", "number", "flips", "lost_bytes")
+_OPTIONS = ("after_s", "delay_s", "ahead_counts", "burst", *_WHOLE)
+_CABLE_OPTIONS = ("for_s", "return_as")
 _POSE = re.compile(r"pose (\d+)\b")
 
 
@@ -54,7 +60,7 @@ class BenchFault:
     value : float
         Of the trigger.
     options : mapping
-        Of the servos' faults.
+        Of the servos' faults, and of a disconnection.
     """
 
     kind: str
@@ -77,7 +83,8 @@ class BenchFault:
             raise ConfigurationError(f"[{entry.place}] kind = {kind!r} is not known; choose one of {known}.")
         on_axis = kind in _AXIS_KINDS
         triggers = (*_FRAME_TRIGGERS, "at_s", *(_BUS_TRIGGERS if on_axis else ()))
-        entry.only(("kind", *triggers, *(("axis", *_OPTIONS) if on_axis else ())))
+        extra = ("axis", *_OPTIONS) if on_axis else _CABLE_OPTIONS if kind == "disconnect" else ()
+        entry.only(("kind", *triggers, *extra))
         given = [name for name in triggers if name in entry.values]
         if len(given) != 1:
             has = " and ".join(given) or "none"
@@ -90,11 +97,10 @@ class BenchFault:
             value = entry.number(trigger, 0.0, 0.0, 1e9)
         else:
             value = float(entry.integer(trigger, 0, 0, 10**9))
-        options: dict[str, float] = {}
-        for name in _OPTIONS:
+        options: dict[str, Any] = {}
+        for name in (*_OPTIONS, *_CABLE_OPTIONS):
             if name in entry.values:
-                whole = name in ("every", "until_instruction", "number")
-                options[name] = entry.integer(name, 0, 0, 10**9) if whole else entry.number(name, 0.0, 0.0, 1e9)
+                options[name] = _option(entry, name)
         fault = cls(kind, axis, trigger, value, options)
         if on_axis:
             fault.for_servo(1)  # refuses impossible combinations now, not in the middle of a scan
@@ -110,15 +116,23 @@ class BenchFault:
             kind = "error"
         if self.trigger in _BUS_TRIGGERS:
             options[self.trigger] = int(self.value)
-        elif kind in ("silent", "hardware", "stuck"):
-            options["at_time_s"] = self.value if self.trigger == "at_s" else now or 0.0
-        elif self.trigger == "at_s":
-            raise ConfigurationError(f"A fault {self.kind!r} counts answers, not seconds; use at_pose or at_instruction.")
         else:
-            # From now on every time: the servo has a first instruction and a first reply behind it.
-            options["at_instruction" if kind == "error" else "at_reply"] = 1
-            options.setdefault("every", 1)
+            options["at_time_s"] = self.value if self.trigger == "at_s" else now or 0.0
+            if kind not in ("silent", *OF_THE_SERVO):
+                options.setdefault("every", 1)
         return Fault(kind, servo_id, **options)
+
+
+def _option(entry: Table, name: str) -> Any:
+    """An option with its type."""
+    if name == "return_as":
+        return entry.text(name, "")
+    if name == "burst":
+        value = entry.values[name]
+        if not isinstance(value, bool):
+            raise ConfigurationError(f"[{entry.place}] burst must be true or false, and is {value!r}.")
+        return value
+    return entry.integer(name, 0, 0, 10**9) if name in _WHOLE else entry.number(name, 0.0, 0.0, 1e9)
 
 
 class Scenario:

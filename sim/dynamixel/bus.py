@@ -42,6 +42,7 @@ class _Counts:
     instructions: int = 0
     replies: int = 0
     struck: set[int] = field(default_factory=set)
+    since: dict[int, int] = field(default_factory=dict)  # by fault: the event at which one of a given time began
 
 
 class DynamixelBus:
@@ -67,6 +68,7 @@ class DynamixelBus:
         self.baudrate: int | None = None
         self.log: deque[tuple[float, Packet]] = deque(maxlen=10_000)
         self._faults: list[Fault] = []
+        self._now = 0.0
         self._parser = Parser()
         self._counts = {servo: _Counts() for servo in self.servos}
         for fault in faults:
@@ -95,6 +97,7 @@ class DynamixelBus:
     def feed(self, data: bytes, t: float) -> list[Reply]:
         """Take bytes that arrived at `t` [s]; return the replies that they cause, in order."""
         replies: list[Reply] = []
+        self._now = t
         for packet in self._parser.receive(data):
             if isinstance(packet, Damaged):
                 replies += self._damaged(packet, t)
@@ -141,19 +144,29 @@ class DynamixelBus:
 
     def _ordered_error(self, servo: Servo) -> int:
         """Error number that a fault makes the servo answer with, or 0."""
-        for fault in self._faults:
-            due = fault.due_at(fault.at_instruction, self._counts[servo].instructions)
-            if fault.kind == "error" and fault.concerns(servo.id) and due:
+        for k, fault in enumerate(self._faults):
+            if fault.kind == "error" and self._due(k, servo, fault.at_instruction, self._counts[servo].instructions):
                 return fault.number
         return 0
+
+    def _due(self, k: int, servo: Servo, trigger: int | None, count: int) -> bool:
+        """Whether the k-th fault strikes this servo's `count`-th event."""
+        fault = self._faults[k]
+        if not fault.concerns(servo.id):
+            return False
+        if fault.at_time_s is not None:
+            if self._now < fault.at_time_s:
+                return False
+            trigger = self._counts[servo].since.setdefault(k, count)
+        return fault.due_at(trigger, count)
 
     def _send(self, servo: Servo, delay: float, data: bytes) -> list[Reply]:
         """Put a reply on the line, unless a fault spoils it."""
         counts = self._counts[servo]
         counts.replies += 1
         sent = [data]
-        for fault in self._faults:
-            if fault.kind in OF_REPLIES and fault.concerns(servo.id) and fault.due_at(fault.at_reply, counts.replies):
+        for k, fault in enumerate(self._faults):
+            if fault.kind in OF_REPLIES and self._due(k, servo, fault.at_reply, counts.replies):
                 sent = [spoilt for reply in sent for spoilt in fault.spoil(reply, counts.replies)]
                 delay += fault.delay_s
         return [(delay, reply) for reply in sent if reply]

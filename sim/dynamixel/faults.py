@@ -27,9 +27,9 @@ INPUT_VOLTAGE = 0x01  # bit 0
 
 _TRIGGERS: Mapping[str, tuple[str, ...]] = {
     "silent": ("at_instruction", "at_goal_write", "at_time_s"),
-    "error": ("at_instruction",),
+    "error": ("at_instruction", "at_time_s"),
     **dict.fromkeys(OF_THE_SERVO, ("at_goal_write", "at_time_s")),
-    **dict.fromkeys(OF_REPLIES, ("at_reply",)),
+    **dict.fromkeys(OF_REPLIES, ("at_reply", "at_time_s")),
 }
 
 
@@ -57,7 +57,7 @@ class Fault:
         When: at the n-th instruction that reaches the servo, the n-th time its Goal Position is written, its n-th
         reply; from 1.
     at_time_s : float, optional
-        When, in rig time [s].
+        When, in rig time [s]; for ``"error"`` and the faults of replies, at the first of them from then on.
     after_s : float, optional
         That much later than `at_goal_write` [s]; a fault in the middle of a move.
     every : int, optional

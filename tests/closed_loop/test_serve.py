@@ -6,6 +6,7 @@ import json
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -158,6 +159,41 @@ def test_an_unplugged_camera_ends_in_one_sentence(tmp_path):
         for _ in range(2):  # the second finds nobody listening
             with pytest.raises(DeviceError, match="is gone"):
                 camera.capture(0.001, label="pose 1 exposure 0")
+
+
+def test_the_bus_returns_under_another_name(tmp_path):
+    """Rationale: a USB adapter that was pulled comes back as another terminal."""
+    scenario = tmp_path / "faults.toml"
+    elsewhere = tmp_path / "elsewhere"
+    scenario.write_text(f'[[fault]]\nkind = "disconnect"\nat_pose = 1\nfor_s = 2.0\nreturn_as = "{elsewhere}"\n')
+    ping = bytes.fromhex("fffffd0001030001194e")
+    with served("--scenario", scenario, "--pty", tmp_path / "bus", "--tcp", 0, "--speed", 20) as (process, ready):
+        host, port = ready["tcp"].removeprefix("socket://").split(":")
+        with socket.create_connection((host, int(port)), BUSY_HOST_S) as line:
+            line.sendall(ping)
+            assert len(line.recv(14)) == 14
+            camera = SocketCamera(ready["camera"])
+            camera.capture(0.001, label="pose 1 exposure 0")
+            assert not os.path.lexists(tmp_path / "bus")
+            assert line.recv(1) == b""  # the end of the connection
+        back = json.loads(process.stdout.readline().removeprefix("returned "))
+        assert back["bus"] == str(elsewhere)
+        with serial.Serial(back["bus"], 1_000_000, timeout=BUSY_HOST_S) as line:
+            line.write(ping)
+            assert len(line.read(14)) == 14
+        camera.close()
+
+
+def test_the_truth_of_every_frame_is_written(tmp_path):
+    log = tmp_path / "truth.jsonl"
+    with served("--config", write_config(tmp_path), "--log", log, "--mjpeg", 0, "--pace") as (_, ready):
+        assert ready["mjpeg"].startswith("http://127.0.0.1:")
+        camera = SocketCamera(ready["camera"])
+        camera.capture(0.001, label="pose 0 exposure 0")
+        camera.close()
+        (entry,) = (json.loads(line) for line in log.read_text().splitlines())
+    assert (entry["label"], entry["specimen"]) == ("pose 0 exposure 0", "sample")
+    assert entry["angles_deg"] == {name: pytest.approx(0.0, abs=1e-9) for name in ("arm", "pan", "tilt")}
 
 
 def test_it_stops_when_standard_input_ends_and_takes_its_link_away(tmp_path):

@@ -406,7 +406,7 @@ def test_a_fault_of_a_scenario_is_checked() -> None:
     with pytest.raises(ConfigurationError, match="kind 'dead' is not known"):
         Fault.from_mapping({"kind": "dead", "at_time_s": 3})
     with pytest.raises(ConfigurationError, match="needs at_reply"):
-        Fault.from_mapping({"kind": "drop", "at_time_s": 3})
+        Fault.from_mapping({"kind": "drop", "at_goal_write": 3})
 
 
 def test_time_is_evaluated_and_not_ticked() -> None:
