@@ -1,6 +1,6 @@
 """Other people's clients against ``gonio sim serve``, as their users call them.
 
-rustypot has a Protocol 2.0 of its own, in Rust; lerobot drives arms through the vendor's SDK. Each is skipped where it is not
+rustypot has a Protocol 2.0 of its own, in Rust; lerobot drives arms through the SDK. Each is skipped where it is not
 installed: rustypot comes with the extra ``clients``, lerobot needs torch and comes by itself. For bluesky see
 tests/closed_loop/test_bluesky.py.
 """
