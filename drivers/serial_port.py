@@ -28,13 +28,30 @@ _PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")  # Linux, macOS
 _PLAIN_BAUD = 115200
 
 
+def resolve(url: str) -> str:
+    """The path or URL that `url` means: a pattern of file names (``/dev/serial/by-id/*FTDI*``) means its only match.
+
+    Raises
+    ------
+    DeviceError
+        If a pattern has no match, or several.
+    """
+    if "://" in url or not any(c in url for c in "*?["):
+        return url
+    found = sorted(str(path) for path in Path(url).parent.glob(Path(url).name))
+    if len(found) != 1:
+        what = f"several ports: {', '.join(found)}; make it narrower" if found else "no port; plug the adapter in"
+        raise DeviceError(f"The pattern {url} means {what}.")
+    return found[0]
+
+
 def open_port(url: str, *, baud: int, slice_s: float = READ_SLICE_S, write_timeout_s: float = 1.0) -> Any:
     """Open a serial port exclusively.
 
     Parameters
     ----------
     url : str
-        A path (``/dev/ttyUSB0``, ``COM3``) or a pyserial URL (``socket://host:port``, ``rfc2217://...``).
+        A path (``/dev/ttyUSB0``, ``COM3``), a pattern of one, or a pyserial URL (``socket://host:port``, ``rfc2217://...``).
     baud : int
         Line rate [bit/s].
     slice_s : float, optional
@@ -60,6 +77,7 @@ def open_port(url: str, *, baud: int, slice_s: float = READ_SLICE_S, write_timeo
     """
     import serial
 
+    url = resolve(url)
     plain = "://" not in url
     options: dict[str, Any] = {"timeout": slice_s, "write_timeout": write_timeout_s}
     try:
@@ -81,10 +99,10 @@ def lock_path(url: str) -> Path:
 
 def holder(url: str) -> int | None:
     """Process on this machine that holds a port, None if none does or it cannot be told."""
-    if "://" in url or not lock_path(url).exists():
+    if "://" in url or not (path := lock_path(resolve(url))).exists():
         return None
     try:
-        FileLock(lock_path(url)).acquire().release()
+        FileLock(path).acquire().release()
     except HeldError as held:
         return held.pid
     except OSError:
@@ -174,13 +192,17 @@ def _explain(url: str, baud: int, error: Exception) -> str:
     return f"Port {url} cannot be opened ({text}); check cable, power and the name in rig.toml."
 
 
+class PortLostError(DeviceError):
+    """A port that was open is gone."""
+
+
 @contextmanager
 def port_errors(thing: str) -> Iterator[None]:
-    """Turn a failure of the port (unplugged, closed by the other end) into a `DeviceError` that names `thing`."""
+    """Turn a failure of the port (unplugged, closed by the other end) into a `PortLostError` that names `thing`."""
     try:
         yield
     except Exception as error:
         # serial.SerialException is an OSError; flushing a vanished terminal raises termios.error, which is not
         if not isinstance(error, OSError) and type(error).__module__ != "termios":
             raise
-        raise DeviceError(f"{thing} failed ({error}); plug it in again, check its power, and resume.") from error
+        raise PortLostError(f"{thing} failed ({error}); plug it in again, check its power, and resume.") from error

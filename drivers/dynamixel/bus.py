@@ -75,6 +75,9 @@ class Bus:
         After a timeout, how long the line must be silent [s], on `now`.
     attempts : int, optional
         Tries of one transaction before it is an error.
+    return_s : float, optional
+        How long an adapter that was unplugged may take to come back [s, of the wall's time], under its name or, if `port`
+        is a pattern (``/dev/serial/by-id/*FTDI*``), under another one.
     protocol : float, optional
         2.0; anything else is refused.
     """
@@ -89,6 +92,7 @@ class Bus:
         now: Callable[[], float] = time.monotonic,
         drain_s: float = 0.25,
         attempts: int = 3,
+        return_s: float = 0.0,
         protocol: float = 2.0,
     ) -> None:
         if protocol != 2.0:
@@ -104,7 +108,8 @@ class Bus:
         self.port_name = port
         self.clock = clock
         self._line = Line(
-            port, baud=baud, timeout_s=timeout_s, drain_s=drain_s, now=now, attempts=attempts, label=self.label
+            port, baud=baud, timeout_s=timeout_s, drain_s=drain_s, now=now, attempts=attempts, return_s=return_s,
+            label=self.label,
         )
         self._members: dict[int, Member] = {}
         self._last: dict[int, int] = {}  # last position seen [counts]

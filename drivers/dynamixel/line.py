@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, INST_READ
 
 from drivers.dynamixel.sdk import ERROR_AT, ID_AT, LENGTH_AT, PARAMETERS_AT, Packets, Port
-from drivers.serial_port import port_errors
+from drivers.serial_port import PortLostError, port_errors
 from gonio.errors import DeviceError, DeviceTimeoutError, ProtocolError
 
 logger = logging.getLogger(__name__)
@@ -29,6 +30,7 @@ _ID_ADDRESS = 7
 _DRAIN_LIMIT_S = 5.0
 _HASTY_TIMEOUT_S = 0.05  # above the latency of a USB adapter, there and back
 _STATUS_CRC = 3
+_RETURN_STEP_S = 0.1
 
 
 class Line:
@@ -46,6 +48,9 @@ class Line:
         Seconds of the port's own time, never going back.
     attempts : int
         Tries of one transaction before it is an error.
+    return_s : float
+        How long a port that is lost may take to come back, under its name or as another match of its pattern [s], of the
+        wall's time.
     label : callable
         A servo id as messages name it.
 
@@ -57,6 +62,8 @@ class Line:
         Tries that got no valid answer.
     failing : set of int
         Servos that did not answer the last time.
+    returns : int
+        How often the port was lost and came back.
     """
 
     def __init__(
@@ -68,6 +75,7 @@ class Line:
         drain_s: float,
         now: Callable[[], float],
         attempts: int,
+        return_s: float,
         label: Callable[[int], str],
     ) -> None:
         self.url = url
@@ -78,11 +86,14 @@ class Line:
         self.lock = threading.RLock()
         self.timeouts = 0
         self.failing: set[int] = set()
+        self.returns = 0
         self._now = now
+        self._return_s = return_s
         self._label = label
         self._port = Port(url, timeout_s=timeout_s, now=now)
         self._packets = Packets()
         self._owing: set[int] = set()  # servos whose answer may still come
+        self._asked: set[int] = set()  # servos that were ever asked
         self._fences = 0
 
     def open(self) -> None:
@@ -143,8 +154,14 @@ class Line:
                     self._port.timeout_s = min(self.timeout_s, _HASTY_TIMEOUT_S)
                 elif servo_id in self._owing and not self._fence(servo_id):
                     break
-                started()
-                result, data, error = self._exchange(servo_id, instruction, parameters, length)
+                try:
+                    started()
+                    result, data, error = self._exchange(servo_id, instruction, parameters, length)
+                except PortLostError:
+                    if hasty or attempt == allowed or not self._return_s:
+                        raise
+                    self._come_back()
+                    continue
                 if result == COMM_SUCCESS and error & 0x7F != _STATUS_CRC:
                     self.failing.discard(servo_id)
                     return data, error
@@ -157,10 +174,30 @@ class Line:
             self.failing.add(servo_id)
         raise self._silence(servo_id, result)
 
+    def _come_back(self) -> None:
+        """Open the port again, as soon as it is there; then every servo may still owe an answer."""
+        end_s = time.monotonic() + self._return_s
+        logger.warning("port %s is lost; waiting up to %g s for it", self.url, self._return_s)
+        while True:
+            try:
+                with suppress(Exception):  # the port is gone, and so are its ways to be closed
+                    self._port.closePort()
+                self._port.is_open = False
+                self.open()
+            except DeviceError:
+                if time.monotonic() >= end_s:
+                    raise
+                time.sleep(_RETURN_STEP_S)
+                continue
+            self.returns += 1
+            self._owing |= self._asked
+            return
+
     def _exchange(self, servo_id: int, instruction: int, parameters: bytes, length: int) -> tuple[int, bytes, int]:
         """One try; the SDK's result, data, error byte. Answers of other servos or other lengths are passed over."""
         with self._transaction():
             self._owing.add(servo_id)
+            self._asked.add(servo_id)
             self._sent(self._packets.transmit(self._port, servo_id, instruction, parameters, length))
             while True:
                 packet, result = self._packets.rxPacket(self._port, False)

@@ -37,12 +37,15 @@ class BusConfig:
         Of a packet, in wall time [s].
     watchdog_s : float
         A real servo stops by itself if it hears nothing for so long during a move [s]; 0 for never.
+    return_s : float
+        How long an adapter that was unplugged may take to come back [s].
     """
 
     port: str
     baud: int
     timeout_s: float
     watchdog_s: float
+    return_s: float
 
 
 @dataclass(frozen=True)
@@ -267,6 +270,7 @@ def parse_rig(text: str, name: str = "rig.toml", *, folder: Path | None = None) 
             baud=bus.integer("baud", 1_000_000, lower=9600, upper=4_500_000, unit="bit/s"),
             timeout_s=bus.number("timeout_s", 0.5, lower=0.005, upper=30.0, unit="s"),
             watchdog_s=bus.number("watchdog_s", 1.0, lower=0.0, upper=2.54, unit="s"),
+            return_s=bus.number("return_s", 10.0, lower=0.0, upper=3600.0, unit="s"),
         ),
         axes={axis: _axis(axes.table(axis), axis) for axis in AXES},
         camera=camera,

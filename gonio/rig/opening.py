@@ -238,7 +238,9 @@ def _real(config: RigConfig, stack: ExitStack, ask: Ask | None) -> Rig:
     camera = _camera(config.camera, clock)
     if camera is not None:
         stack.callback(camera.close)
-    bus = Bus(config.bus.port, clock=clock, baud=config.bus.baud, timeout_s=config.bus.timeout_s)
+    bus = Bus(
+        config.bus.port, clock=clock, baud=config.bus.baud, timeout_s=config.bus.timeout_s, return_s=config.bus.return_s
+    )
     axes = _connect(bus, config, stack, watchdog_s=config.bus.watchdog_s or None)
     return Rig(config, clock, bus, axes, camera, lamp, mount, lambda: None)
 

@@ -132,3 +132,54 @@ def test_errors_of_opening_name_port_and_remedy(tmp_path: Path) -> None:
     plain.write_text("not a port")
     with pytest.raises(DeviceError, match=f"Port {plain} cannot be opened"):
         open_port(str(plain), baud=1_000_000)
+
+
+class Unplugged:
+    """A bus on a pseudo-terminal that can be pulled out and comes back under another name."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.clock, self.number = folder, ScaledClock(1.0), 0
+        self.servo = SimServo(1, initial_counts=2000.0)
+        self.line = DynamixelBus([self.servo])
+        self._stop, self._thread, self._pump = threading.Event(), threading.Thread(), Pump()
+        self.plug()
+
+    def plug(self) -> None:
+        self.number += 1
+        self.path = self.folder / f"adapter{self.number}"
+        self._pump = Pump(PtyLink(self.line, self.clock, self.path))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._pump.run, args=(self._stop.is_set, 0.01), daemon=True)
+        self._thread.start()
+
+    def pull(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._pump.close()
+        self.path.unlink(missing_ok=True)
+
+
+def test_an_adapter_returns_under_another_name(tmp_path: Path) -> None:
+    adapter = Unplugged(tmp_path)
+    with Bus(f"{tmp_path}/adapter*", clock=adapter.clock, timeout_s=1.0, drain_s=0.05, return_s=30.0) as bus:
+        assert bus.agreed_block(1).position == 2000
+        adapter.pull()
+        threading.Timer(0.3, adapter.plug).start()
+        assert bus.agreed_block(1).position == 2000
+        assert adapter.number == 2
+        adapter.pull()
+    with pytest.raises(DeviceError, match=r"The pattern .*adapter\* means no port; plug the adapter in"):
+        open_port(f"{tmp_path}/adapter*", baud=57600)
+    (tmp_path / "adapter8").touch()
+    (tmp_path / "adapter9").touch()
+    with pytest.raises(DeviceError, match=r"means several ports: .*adapter8, .*adapter9; make it narrower"):
+        open_port(f"{tmp_path}/adapter*", baud=57600)
+
+
+def test_an_adapter_that_stays_away(tmp_path: Path) -> None:
+    adapter = Unplugged(tmp_path)
+    with Bus(str(adapter.path), clock=adapter.clock, timeout_s=1.0, return_s=0.2) as bus:
+        assert bus.ping(1)[0] == 1020
+        adapter.pull()
+        with pytest.raises(DeviceError, match=r"Port .*adapter1 does not exist; plug the adapter in"):
+            bus.ping(1)
