@@ -38,19 +38,22 @@ def _named(value: Any) -> str:
     return "-".join([value[0], *map(str, value[1].values())])
 
 
-def check(name: str, choices: dict[str, Any], data: st.DataObject, number: int) -> None:
-    brdf = make(name, **data.draw(parameter_sets(name, **choices)))
-    assert reciprocity(brdf, 200, number) <= LIMIT
+def check(model: tuple[str, dict[str, Any]], count: int, first_seed: int = 0) -> None:
+    """As many parameter sets of a model."""
+    name, choices = model
+
+    @seed(first_seed)
+    @settings(max_examples=count, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @given(parameters=parameter_sets(name, **choices), number=st.integers(0, 2**31))
+    def run(parameters: dict[str, Any], number: int) -> None:
+        assert reciprocity(make(name, **parameters), 200, number) <= LIMIT
+
+    run()
 
 
 @pytest.mark.parametrize("model", [*MODELS, *BARE], ids=_named)
 def test_any_parameters(model: tuple[str, dict[str, Any]]) -> None:
-    @settings(max_examples=30, deadline=None, derandomize=True)
-    @given(data=st.data(), number=st.integers(0, 2**31))
-    def run(data: st.DataObject, number: int) -> None:
-        check(*model, data, number)
-
-    run()
+    check(model, 30)
 
 
 @pytest.mark.gate
@@ -63,14 +66,7 @@ def test_gate_any_parameters() -> None:
     each = -(-(GATE_TOTAL - sum(n for _, n in counts)) // len(quick))
     counts += [(m, each) for m in quick]
     for k, (model, count) in enumerate(counts):
-
-        @seed(k)
-        @settings(max_examples=count, deadline=None, database=None, suppress_health_check=list(HealthCheck))
-        @given(data=st.data(), number=st.integers(0, 2**31))
-        def run(data: st.DataObject, number: int, model: tuple[str, dict[str, Any]] = model) -> None:
-            check(*model, data, number)
-
-        run()
+        check(model, count, k)
     total = sum(n for _, n in counts)
     record(
         "BRDF models with any parameters",
