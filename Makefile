@@ -21,8 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP)
 	$(BIN)/gonio demo --out runs/demo
 
+# Two workers, a file of tests to each: the kernels of a file are compiled once.
 test: $(STAMP)
-	$(BIN)/python -m pytest -m "not gate"
+	$(BIN)/python -m pytest -m "not gate" -n 2 --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
