@@ -24,9 +24,9 @@ from gonio.brdf.base import BRDF
 from gonio.errors import GeometryError, ParameterError
 from gonio.fields import Field
 from gonio.integrate import closed_forms, viewpoint
-from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients
+from gonio.integrate.lights import over_field
 from gonio.integrate.methods import Run
 from gonio.integrate.plan import Method, plan
 from gonio.integrate.quadrature import integrate_cap

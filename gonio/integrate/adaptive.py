@@ -4,7 +4,7 @@ The cells of `gonio.integrate.cells` are free of every edge that is known. Each 
 rules; what the 7-point Gauss rules inside them miss is its error, so the error of a total is that of a far coarser rule.
 Cells are halved, in the direction that errs, until the errors of an element add up to its tolerance. Before that, cells
 near a declared lobe are halved down to its width, so that no lobe is too narrow to be seen. All elements advance together,
-array by array.
+array by array. Regions and light of the parts of a source come from `gonio.integrate.lights`.
 
 What is not declared, an edge or a lobe in a user's function, is found as far as the nodes hit it.
 
@@ -24,10 +24,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError, ParameterError
-from gonio.fields import EnvironmentMap, Field, Lobes
 from gonio.integrate.cells import COLUMNS, GAUSS, KRONROD, MOST_PLANES, NODES, build, fill, place
-from gonio.integrate.frames import Elements
-from gonio.source import Cap
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -38,7 +35,7 @@ _CHUNK = 1024  # cells evaluated at once: 30 MiB
 _LARGEST = 1 << 24  # nodes for one element
 _SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of the rules
 _GROWTH = 8.0  # of panels away from the horizon
-_GRAZING = 0.05  # cosine below which a view is grazing: its lobe is a streak
+GRAZING = 0.05  # cosine below which a view is grazing: its lobe is a streak
 _DEEPEST = 2.0**-40  # of a base cell's side
 _RULES = np.stack((KRONROD, GAUSS), axis=1)
 
@@ -148,71 +145,6 @@ def integrate(
             block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), here, lit, reverse, effort)
             value[lit], error[lit] = block.run(rtol, atol)
     return value, error
-
-
-def over_cap(
-    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool, effort: Counter
-) -> tuple[Array, Array]:
-    """Reflected radiance of each element due to one term and one cap: `integrate` with the cap's radiance."""
-    axis, profile = elements.local(cap.axis), cap.profile
-
-    def radiance(directions: Array, element: Index) -> Array:
-        if profile is None:
-            return np.full(len(directions), cap.radiance)
-        return np.asarray(cap.radiance * profile(np.einsum("ij,ij->i", directions, axis[element])))
-
-    region = Region(axis, cap.half_angle, about_normal)
-    return integrate(term, elements.viewer(), region, Light(radiance), rtol=rtol, atol=atol, effort=effort)
-
-
-def over_field(
-    term: Term,
-    field: Field,
-    elements: Elements,
-    *,
-    rtol: float,
-    atol: float,
-    effort: Counter,
-    about_normal: bool | None = None,
-) -> tuple[Array, Array]:
-    """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared.
-
-    Polar coordinates about the normal, or else about the field's own pole; by default the pole for an environment map, whose
-    rows are rings about it, unless the view is grazing, when more circles lie along the horizon; the normal for the others.
-    """
-    if about_normal is None and isinstance(field, EnvironmentMap):
-        value, error = np.zeros(len(elements)), np.zeros(len(elements))
-        grazing = elements.cos_theta < _GRAZING
-        for local in (False, True):
-            some = np.flatnonzero(grazing == local)
-            value[some], error[some] = over_field(
-                term, field, elements.select(some), rtol=rtol, atol=atol, effort=effort, about_normal=local
-            )
-        return value, error
-    n = len(elements)
-    # (n, 3, 3), from viewer-oriented to local
-    turn = np.stack([elements.local(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))], axis=-1)
-
-    def radiance(directions: Array, element: Index) -> Array:
-        return field.at(np.einsum("ij,ijk->ik", directions, turn[element]))
-
-    light = Light(radiance)
-    region = Region(turn[:, :, 2], math.pi, about_normal is not False)
-    if isinstance(field, Lobes):
-        lit = field.amplitude > 0
-        peaks = np.einsum("nij,fj->nfi", turn, field.axes()[lit])
-        light = light._replace(peaks=peaks, widths=1.0 / np.sqrt(np.maximum(field.kappa[lit], 1.0)))
-    elif isinstance(field, EnvironmentMap):  # panels between rows, cells between columns
-        rows, columns = field.samples.shape
-        phi = np.unique(np.mod((np.arange(columns) + 0.5) * (2.0 * np.pi / columns), np.pi).round(12))
-        circles = [(0.0, 0.0, 1.0, (i + 0.5) * math.pi / rows) for i in range(rows)]
-        circles += [(-math.sin(f), math.cos(f), 0.0, math.pi / 2) for f in phi]
-        fixed = np.array(circles)
-        centres = np.einsum("nij,fj->nfi", turn, fixed[:, :3])
-        light = light._replace(planes=np.concatenate((centres, np.tile(fixed[None, :, 3:], (n, 1, 1))), axis=2))
-    else:
-        light = light._replace(detail=field.detail)
-    return integrate(term, elements.viewer(), region, light, rtol=rtol, atol=atol, effort=effort)
 
 
 class _Block:
@@ -374,7 +306,7 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
         # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
         layer = max(1e-9, min(float(fixed[k, 2]), term.layer_width()))
         own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
-        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < _GRAZING:
+        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < GRAZING:
             own.append(_streak(fixed[k], max(1e-9, (term.lobe_width() or 1.0) * float(fixed[k, 2]))))
         if light is not None and light.planes is not None:
             own.append(light.planes[k].tolist())

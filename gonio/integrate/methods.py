@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from gonio.fields import EnvironmentMap, Field
 from gonio.integrate import closed_forms, disk, quadtree, radial
 from gonio.integrate import threads as tiling
-from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients, add_beam, add_diffuse
+from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
 from gonio.integrate.results import ROUNDING

@@ -21,9 +21,9 @@ from gonio import jit
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
 from gonio.integrate import threads as tiling
-from gonio.integrate.adaptive import over_cap
 from gonio.integrate.cap import NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
+from gonio.integrate.lights import over_cap
 from gonio.source import Cap
 
 Array = NDArray[np.float64]

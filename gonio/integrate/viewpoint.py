@@ -20,8 +20,8 @@ from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.fields import Field, FunctionField, Harmonics, Lobes
 from gonio.geometry import angles, unit_vector
 from gonio.integrate import closed_forms
-from gonio.integrate.adaptive import over_field
 from gonio.integrate.frames import Elements
+from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step, plan
 from gonio.integrate.results import MapValues, insist
 from gonio.source import Cap, Collimated, Part, Source

@@ -14,6 +14,7 @@ import gonio
 from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.integrate import MapValues, adaptive, scene_radiance
 from gonio.integrate.frames import Elements
+from gonio.integrate.lights import over_cap
 from gonio.integrate.quadrature import Effort
 from gonio.source import Cap, Source
 
@@ -255,7 +256,7 @@ def test_extreme_scenes_are_honest(
     elements = Elements.from_gradient(p, q)
     for term in brdf.terms:
         got = [
-            adaptive.over_cap(term, cap, elements, rtol=rtol, atol=1e-12, about_normal=normal, effort=Effort())
+            over_cap(term, cap, elements, rtol=rtol, atol=1e-12, about_normal=normal, effort=Effort())
             for rtol, normal in ((1e-6, True), (1e-10, False))
         ]
         (v, e), (truth, u) = got
