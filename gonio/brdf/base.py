@@ -216,8 +216,14 @@ class Term:
     @property
     def mirror_only(self) -> bool:
         """Compiled, isotropic, without narrow structures elsewhere than at the mirror direction and unknown bends."""
+        return self.upright and len(self.features(_SLANTED)) == 0
+
+    @property
+    def upright(self) -> bool:
+        """Compiled, isotropic, without unknown bends, and narrow in directions of the plane of incidence only."""
         model = self.model
-        return model.function is not None and model.isotropic and not model.bent and len(self.features(_SLANTED)) == 0
+        plain = model.function is not None and model.isotropic and not model.bent
+        return plain and bool(np.all(self.features(_SLANTED)[:, 1] == 0.0))
 
     def features(self, omega_r: Array) -> Array:
         """Narrow structures elsewhere than at the mirror: rows of a unit vector and a half width [rad], shape (k, 4)."""

@@ -78,7 +78,7 @@ def _step(term: Term, part: Part) -> Step:
         return Step(term, part, Method.BEAM, "a beam: one evaluation per gradient; back-facing gradients are 0")
     if mirror:
         return Step(term, part, Method.MIRROR, "a mirror: the source seen in the mirror direction")
-    if isinstance(part, Field) and term.mirror_only:
+    if isinstance(part, Field) and term.upright:
         return Step(term, part, Method.RINGS, "isotropic: one kernel for all phi_n, the field's waves apart")
     if isinstance(part, Field):
         return Step(term, part, Method.FIELD, "a radiance field: cells between its edges and the surface's horizon")

@@ -61,14 +61,15 @@ def ring_kernel(function: Callable[..., float]) -> Any:
     """Compiled kernel of one model's function.
 
     Its arguments: ``slopes`` (k, 2), cos and sin of theta_n; the term's parameters, weight and lobe ``width``; ``layers``
-    (k,), ``planes`` (k, j, 4); ``edges`` and ``detail``, `Spectrum.groups` or the rows of a map; ``breaks`` and ``series``
+    (k,); ``peaks`` (k, i, 3) in the plane of incidence: theta, cos D and half width; ``planes`` (k, j, 4);
+    ``edges`` and ``detail``, `Spectrum.groups` or the rows of a map; ``breaks`` and ``series``
     of the `Spectrum`; what it needs (`Needed`) and the ``error`` (panels,) of the series; whether ``rows`` are kinks;
     natural ``digits``; `gauss_table`; ``out`` (k, 3, waves >= 3), which receives A_m, B_m and, in its last row, the
     directional albedo, the error of R due to that of the series, and that due to waves that are cut off; ``effort`` (1,),
     evaluations.
     """
 
-    def ring_sums(slopes, p, weight, width, layers, planes, edges, detail, breaks, series, used, bent, rest, cut, error, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
+    def ring_sums(slopes, p, weight, width, layers, peaks, planes, edges, detail, breaks, series, used, bent, rest, cut, error, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
         most = out.shape[2]
         points, cuts = np.empty(CAPACITY + 2 * breaks.size), np.empty(planes.shape[1])
         touch = np.empty((2 + 2 * planes.shape[1], 2))
@@ -85,7 +86,9 @@ def ring_kernel(function: Callable[..., float]) -> Any:
             total = out[slope]
             total[:] = 0.0
             touching = tangents(touch, sn, cn, theta_n, planes[slope])
-            panels = theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, planes[slope], edges, rows)
+            panels = theta_panels(
+                points, touch, touching, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], edges, rows
+            )
             held = 0  # the panel of the source whose moments are being summed
             for panel in range(panels - 1):
                 a, b = points[panel], points[panel + 1]
@@ -99,7 +102,9 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                 else:
                     z = SERIES * (b - a) * finest_detail(edges, detail, a, b)
                     bend, beyond = bend + 0.5 * z, max(beyond, 0.5 * (digits * digits * z) ** (1.0 / 3.0))
-                order, starts, ends = theta_order(a, b, touch, touching, theta_n, width, layer, bend, beyond, digits)
+                order, starts, ends = theta_order(
+                    a, b, touch, touching, theta_n, width, layer, peaks[slope], bend, beyond, digits
+                )
                 pieces = max(1, math.ceil(order / LARGEST_ORDER))
                 q = min(LARGEST_ORDER, max(2, math.ceil(order / pieces)))
                 start = q * (q - 1) // 2
@@ -118,8 +123,8 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                     k = _panel_of(breaks, t)
                     waves = min(used[k], most)
                     n = ring_nodes(
-                        cuts, t, st, ct, sn, cn, theta_n, width, layer, planes[slope], 0.25 * (waves - 1), rest[0, k],
-                        digits, 2.0 * st * dt * weight, x_table, w_table, nodes, weights,
+                        cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], 0.25 * (waves - 1),
+                        rest[0, k], digits, 2.0 * st * dt * weight, x_table, w_table, nodes, weights,
                     )  # fmt: skip
                     effort[0] += n
                     for j in range(n):

@@ -1,7 +1,8 @@
 r"""Where the sums of `ring_kernel` are taken: panels of theta, and nodes in azimuth on half a ring.
 
-Panels grow from the features: the lobe, the horizon and its layer of shadowing, kinks, the rows of a map. A lobe of half
-width w in half-vector angle has its poles, on the ring theta, at :math:`D = \pm 2i\,\mathrm{asinh}\,e`,
+Panels grow from the features: the lobe and other peaks in the plane of incidence, the horizon and its layer of shadowing,
+kinks, the rows of a map. A lobe of half width w in half-vector angle has its poles, on the ring theta, at
+:math:`D = \pm 2i\,\mathrm{asinh}\,e`,
 :math:`4e^2\sin\frac\theta2\sin\theta_n = w^2 + 4\sin^2\frac{\theta/2-\theta_n}{2}` (exact for GGX up to the definition of w,
 from :math:`\cos\theta_h = \cos\frac\theta2\cos\theta_n+\sin\frac\theta2\sin\theta_n\cos D`). A Gauss rule of q nodes errs by
 :math:`\rho^{-2q}` with rho of the ellipse through the nearest pole [1]_; q follows from it for every panel. On top come
@@ -118,7 +119,7 @@ def tangents(touch, sn, cn, theta_n, planes):  # type: ignore[no-untyped-def]
 
 
 @jit.part
-def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, planes, edges, rows):  # type: ignore[no-untyped-def]
+def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, peaks, planes, edges, rows):  # type: ignore[no-untyped-def]
     """Edges of the panels in theta; returns how many. ``edges``: rows of a map, or where another field changes detail."""
     upper = touch[1, 0]
     n = 0
@@ -138,6 +139,8 @@ def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, planes,
         n = _insert_apart(points, n, edges[k], apart, upper)
     if width < 10.0:
         n = _grow(points, n, 2.0 * theta_n, 2.0 * width, 0.0, upper)
+    for k in range(peaks.shape[0]):
+        n = _grow(points, n, peaks[k, 0], peaks[k, 2], 0.0, upper)
     if layer < 10.0:
         n = _grow(points, n, upper, layer, 0.0, upper)
         n = _grow(points, n, touch[0, 0], layer, 0.0, upper)
@@ -221,7 +224,7 @@ def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: igno
 
 
 @jit.part
-def theta_order(a, b, touch, touching, theta_n, width, layer, bend, rest, digits):  # type: ignore[no-untyped-def]
+def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, bend, rest, digits):  # type: ignore[no-untyped-def]
     """Order for a panel of theta, and whether it starts and whether it ends with a square root.
 
     Besides the BRDF's own: ``bend`` nodes for the degrees of what oscillates, ``rest`` for what its series have beyond.
@@ -239,6 +242,8 @@ def theta_order(a, b, touch, touching, theta_n, width, layer, bend, rest, digits
         stretch = _stretch(a, b, 2.0 * theta_n, 2.0 * width)
     if layer < 10.0:
         stretch = min(stretch, _stretch(a, b, touch[1, 0], layer), _stretch(a, b, touch[0, 0], layer))
+    for k in range(peaks.shape[0]):
+        stretch = min(stretch, _stretch(a, b, peaks[k, 0], peaks[k, 2]))
     order = max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest)
     if starts or ends:
         return bend + 2.0 * order + 2.0, starts, ends
@@ -246,7 +251,7 @@ def theta_order(a, b, touch, touching, theta_n, width, layer, bend, rest, digits
 
 
 @jit.part
-def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, planes, bend, rest, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
+def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, bend, rest, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
     """Nodes in D on the half ring from 0 to the horizon, weights times `scale`; how many, a multiple of `LANES`."""
     reach, clipped = _reach(st, ct, sn, cn)
     if reach == 0.0:
@@ -256,6 +261,15 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, planes, bend, res
     if width < 10.0:
         squared = (width * width + 4.0 * math.sin(0.25 * t - 0.5 * theta_n) ** 2) / max(4.0 * math.sin(0.5 * t) * sn, 1e-300)
         pole = max(2.0 * math.asinh(math.sqrt(squared)), 1e-10)
+    opposite = 1e9  # distance of the poles of peaks at D = pi
+    for k in range(peaks.shape[0]):
+        squared = peaks[k, 2] ** 2 + 4.0 * math.sin(0.5 * (t - peaks[k, 0])) ** 2
+        squared /= max(4.0 * st * math.sin(peaks[k, 0]), 1e-300)
+        distance = max(2.0 * math.asinh(math.sqrt(squared)), 1e-10)
+        if peaks[k, 1] > 0.0:
+            pole = min(pole, distance)
+        else:
+            opposite = min(opposite, distance)
     if layer < 10.0:  # at the horizon, or where the ring comes nearest to it
         edge = math.sqrt(2.0 * (layer + max(0.0, ct * cn - product)) / max(product, 1e-300))
         slope = product * math.sin(reach)
@@ -283,7 +297,7 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, planes, bend, res
         if stop - b < 0.4 * (b - a):
             b = stop
         to_lobe, to_edge = math.sqrt(b * b + pole * pole), math.sqrt((reach - b) ** 2 + edge * edge)
-        stretch = min(from_lobe + to_lobe, from_edge + to_edge) / (b - a)
+        stretch = min(from_lobe + to_lobe, from_edge + to_edge, math.sqrt((b - a) ** 2 + 4.0 * opposite**2)) / (b - a)
         order = bend * (b - a) + max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest * root(b - a)) + 0.5
         count = _arc(x_table, w_table, a, b, order, scale, nodes, weights, count)
         a, from_lobe, from_edge = b, to_lobe, to_edge

@@ -45,7 +45,7 @@ class Scene:
         """What `ring_kernel` gives for slopes tan(theta_n / 2), shape (n, 3, waves), to a number of digits."""
         slopes = np.stack(((1.0 - tau) * (1.0 + tau), 2.0 * tau), axis=1) / (1.0 + tau * tau)[:, None]
         layers = self._layers(slopes[:, 0])
-        planes = self._planes(slopes)
+        peaks, planes = self._peaks(slopes), self._planes(slopes)
         out = np.zeros((len(tau), 3, waves))
         x, w = gauss_table()
         kernel: Any = ring_kernel(self.term.model.function)
@@ -55,9 +55,9 @@ class Scene:
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
-                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], planes[tile], edges, detail,
-                self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows, digits * math.log(10.0), x, w,
-                out[tile], effort,
+                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile], edges,
+                detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
+                digits * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
 
@@ -72,6 +72,13 @@ class Scene:
         if self.term.model.diffuse:
             return np.full(len(cosine), NONE)
         return np.maximum(cosine, 1e-9)
+
+    def _peaks(self, slopes: Array) -> Array:
+        """Features of the term, all in the plane of incidence: theta, cos D (1, -1) and half width, shape (n, k, 3)."""
+        rows = np.array([self.term.features(np.array((-s, 0.0, c))) for c, s in slopes])
+        angle = np.arctan2(rows[..., 0], rows[..., 2]) + np.arctan2(slopes[:, 1], slopes[:, 0])[:, None]
+        side = np.where(angle < 0.0, -1.0, 1.0)
+        return np.stack((np.abs(angle), side, np.maximum(rows[..., 3], 1e-9)), axis=-1)
 
     def _planes(self, slopes: Array) -> Array:
         """Planes of kinks in the local frames, shape (n, k, 4), filled up with planes that meet no direction."""
