@@ -171,14 +171,13 @@ class Drive:
         """Current of the motor at `t` [A], with the sign of its torque."""
         return self.torque(t) / self._torque_constant
 
-    def effort(self, t: float) -> float:
-        """Share of the full voltage that the motor gets at `t`, -1 to 1: its speed's and its torque's."""
-        share = self.shaft.at(t)[1] / self.fastest + self.torque(t) / self._motor.stall_torque_nm
-        return max(-1.0, min(1.0, share)) if self.on else 0.0
-
-    def voltage(self, t: float) -> float:
-        """What is left of the supply's voltage at the connector at `t` [V]."""
-        return self.supply_v - _SUPPLY_OHM * abs(self.current(t))
+    def feel(self, t: float) -> tuple[float, float, float, float]:
+        """At `t`: torque [N m], current [A], share of the full voltage (-1 to 1), and voltage at the connector [V]."""
+        torque = self.torque(t)
+        current = torque / self._torque_constant
+        # the motor needs a share of the voltage for its speed, and one for its torque
+        share = self.shaft.at(t)[1] / self.fastest + torque / self._motor.stall_torque_nm
+        return torque, current, max(-1.0, min(1.0, share)) if self.on else 0.0, self.supply_v - _SUPPLY_OHM * abs(current)
 
     @property
     def _torque_constant(self) -> float:

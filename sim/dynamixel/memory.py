@@ -34,35 +34,23 @@ class Memory:
 
     def __init__(self, model: Model, firmware: int) -> None:
         self._model = model
-        self._raw = bytearray(model.size)
         self._covering = {a: r for a, r in model.covering.items() if r.since <= firmware}
+        self._values = {register.name: register.default for register in model.registers}
+        self._layouts: dict[tuple[int, int], list[Register] | None] = {}
         self._backup: dict[Register, int] = {}
-        for register in model.registers:
-            self.poke(register, register.default)
         self["Firmware Version"] = firmware
 
     def __getitem__(self, name: str) -> int:
-        return self.value(self._model.by_name[name])
+        return self._values[name]
 
     def __setitem__(self, name: str, value: int) -> None:
-        self.poke(self._model.by_name[name], value)
+        self._values[name] = value
 
     def __contains__(self, name: str) -> bool:
-        return name in self._model.by_name
-
-    def value(self, register: Register) -> int:
-        """What a register holds."""
-        raw = self._raw[register.address : register.address + register.size]
-        return int.from_bytes(raw, "little", signed=register.signed)
-
-    def poke(self, register: Register, value: int) -> None:
-        """Set a register, whatever its access; bits that do not fit are cut off."""
-        end = register.address + register.size
-        mask = (1 << 8 * register.size) - 1
-        self._raw[register.address : end] = (value & mask).to_bytes(register.size, "little")
+        return name in self._values
 
     def read(self, address: int, length: int) -> bytes:
-        """Bytes from `address` on.
+        """Bytes from `address` on; bits of a value that do not fit its register are cut off.
 
         Raises
         ------
@@ -71,10 +59,33 @@ class Memory:
         """
         if length < 1:
             raise Refused(ErrorNumber.DATA_LENGTH)
+        key = (address, length)
+        if key not in self._layouts:
+            self._layouts[key] = self._layout(address, length)
+        whole = self._layouts[key]
+        if whole is not None:
+            return b"".join(
+                (self._values[r.name] & ((1 << 8 * r.size) - 1)).to_bytes(r.size, "little") for r in whole
+            )
         where = [self._resolve(a) for a in range(address, address + length)]
         if any(a not in self._covering for a in where):
             raise Refused(ErrorNumber.ACCESS)
-        return bytes(self._raw[a] for a in where)
+        found = bytearray()
+        for a in where:
+            register = self._covering[a]
+            found.append(self._values[register.name] >> 8 * (a - register.address) & 0xFF)
+        return bytes(found)
+
+    def _layout(self, address: int, length: int) -> list[Register] | None:
+        """The registers that fill these bytes exactly, if there are such and none stands for another."""
+        found, at = [], address
+        while at < address + length:
+            register = self._model.at.get(at)
+            if register is None or at not in self._covering or register.name.startswith("Indirect Data"):
+                return None
+            found.append(register)
+            at += register.size
+        return found if at == address + length else None
 
     def items(self, address: int, data: bytes, *, eeprom: bool) -> list[tuple[Register, int]]:
         """Split a write into registers and values.
@@ -104,7 +115,7 @@ class Memory:
     def back_up(self) -> None:
         """Keep the EEPROM and those RAM values that the manual names."""
         self._backup = {
-            r: self.value(r)
+            r: self._values[r.name]
             for r in self._model.registers
             if r.writable and (r.eeprom or r.name in _BACKED_UP or r.name.startswith("Indirect Address"))
         }
@@ -118,12 +129,12 @@ class Memory:
         """Bring back what was kept of the EEPROM, or of the RAM."""
         for register, value in self._backup.items():
             if register.eeprom is eeprom:
-                self.poke(register, value)
+                self._values[register.name] = value
 
     def _resolve(self, address: int) -> int:
         """Follow an indirect address to the byte that it stands for."""
         for block in self._model.indirect:
             if block.data <= address < block.data + block.count:
                 slot = block.address + 2 * (address - block.data)
-                return int.from_bytes(self._raw[slot : slot + 2], "little")
+                return self._values[self._model.at[slot].name]
         return address

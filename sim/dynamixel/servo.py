@@ -15,6 +15,7 @@ https://emanual.robotis.com/docs/en/dxl/protocol2/
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -174,11 +175,8 @@ class Servo:
 
     def advance(self, t: float) -> None:
         """Let everything happen that was due by `t` [s], in order: faults, watchdog, overload, heat."""
-        while True:
-            moment, act = min(self._due(), key=lambda event: event[0], default=(math.inf, None))
-            if act is None or moment > t:
-                return
-            act(moment)
+        while (event := self._next_event(t)) is not None:
+            event()
 
     def schedule(self, fault: Fault) -> None:
         """Have a fault of the servo itself happen at its time or goal write."""
@@ -260,7 +258,7 @@ class Servo:
         kept = {0xFF: (), 0x01: (7,), 0x02: (7, 8)}[option]
         for register in self.model.registers:
             if register.eeprom and register.writable and register.address not in kept:
-                self._memory.poke(register, register.default)
+                self._memory[register.name] = register.default
         self.reboot(t)
 
     def clear(self, params: bytes, t: float) -> None:
@@ -341,8 +339,8 @@ class Servo:
         return bits | (_TORQUE_BY_GOAL if self.reads_fast else 0)
 
     def _apply(self, register: Register, value: int, t: float) -> None:
-        before = self._memory.value(register)
-        self._memory.poke(register, value)
+        before = self._memory[register.name]
+        self._memory[register.name] = value
         if register.address == 116:
             self._goal_written(t)
         elif register.address in (100, 102, 104) and self.torque:
@@ -392,17 +390,18 @@ class Servo:
         memory["Realtime Tick"] = int(t * 1000.0) & 0x7FFF
         memory["Moving"] = int(ongoing or abs(speed) > memory["Moving Threshold"])
         memory["Moving Status"] = status
-        memory["Present PWM"] = self._sign * round(FULL_PWM * drive.effort(t))
+        torque, current, effort, voltage = drive.feel(t)
+        memory["Present PWM"] = self._sign * round(FULL_PWM * effort)
         unit = self.model.motor.current_unit_a
         if unit is None:
-            memory["Present Load"] = self._sign * round(1000.0 * drive.torque(t) / self.model.motor.stall_torque_nm)
+            memory["Present Load"] = self._sign * round(1000.0 * torque / self.model.motor.stall_torque_nm)
         else:
-            memory["Present Current"] = self._sign * round(drive.current(t) / unit)
+            memory["Present Current"] = self._sign * round(current / unit)
         memory["Present Velocity"] = speed
         memory["Present Position"] = present
         memory["Velocity Trajectory"] = self._sign * round(wanted_velocity / VELOCITY_UNIT)
         memory["Position Trajectory"] = following
-        memory["Present Input Voltage"] = round(10.0 * drive.voltage(t))
+        memory["Present Input Voltage"] = round(10.0 * voltage)
         memory["Present Temperature"] = min(round(drive.heat.at(t)), 255)
         memory["Backup Ready"] = int(memory.backed_up)
 
@@ -427,7 +426,7 @@ class Servo:
     def _start_ram(self, t: float) -> None:
         for register in self.model.registers:
             if not register.eeprom:
-                self._memory.poke(register, register.default)
+                self._memory[register.name] = register.default
         self._goal_pending = False
         self._registered = None
         self._last_instruction = t
@@ -501,29 +500,29 @@ class Servo:
 
     # ---- what happens by itself --------------------------------------------------------------------------------
 
-    def _due(self) -> list[tuple[float, Callable[[float], None]]]:
-        """Events that are to come, with their times [s]."""
-        events: list[tuple[float, Callable[[float], None]]] = []
+    def _next_event(self, t: float) -> Callable[[], None] | None:
+        """The first thing that is due by `t` [s] and has not happened yet."""
+        memory, drive = self._memory, self._drive
+        first, event = t, None
         for fault, moment in self._faults:
-            if moment is not None:
-                events.append((moment, lambda at, fault=fault, moment=moment: self._strike(fault, moment, at)))  # type: ignore[misc]
-        watchdog, errors = self._memory["Bus Watchdog"], self._memory["Hardware Error Status"]
+            if moment is not None and moment <= first:
+                first, event = moment, functools.partial(self._strike, fault, moment)
+        errors = memory["Hardware Error Status"]
+        watchdog = memory["Bus Watchdog"]
         if watchdog > 0 and self.torque:
-            # not at, but after that time
             due = self._last_instruction + watchdog * WATCHDOG_UNIT_S
-            events.append((math.nextafter(due, math.inf), lambda at: self._bark(due)))
-        if (rests := self._drive.rests_at()) < math.inf:
-            events.append((rests, self._drive.settle))
-        if not errors & OVERLOAD and (overloaded := self._drive.overloaded_at()) < math.inf:
-            events.append((overloaded, lambda at: self._fail(OVERLOAD, at)))
-        if not errors & OVERHEATING and (hot := self._drive.heat.reaches(self._memory["Temperature Limit"])) < math.inf:
-            events.append((hot, lambda at: self._fail(OVERHEATING, at)))
-        volts = 10.0 * self._drive.supply_v
-        if not errors & INPUT_VOLTAGE and not (
-            self._memory["Min Voltage Limit"] <= volts <= self._memory["Max Voltage Limit"]
-        ):
-            events.append((-math.inf, lambda at: self._fail(INPUT_VOLTAGE, self._last_instruction)))
-        return events
+            if due < first:  # after that time, not at it
+                first, event = due, functools.partial(self._bark, due)
+        if (rests := drive.rests_at()) <= first:
+            first, event = rests, functools.partial(drive.settle, rests)
+        if not errors & OVERLOAD and (overloaded := drive.overloaded_at()) <= first:
+            first, event = overloaded, functools.partial(self._fail, OVERLOAD, overloaded)
+        if not errors & OVERHEATING and (hot := drive.heat.reaches(memory["Temperature Limit"])) <= first:
+            first, event = hot, functools.partial(self._fail, OVERHEATING, hot)
+        volts = 10.0 * drive.supply_v
+        if not errors & INPUT_VOLTAGE and not memory["Min Voltage Limit"] <= volts <= memory["Max Voltage Limit"]:
+            event = functools.partial(self._fail, INPUT_VOLTAGE, self._last_instruction)
+        return event
 
     def _bark(self, due: float) -> None:
         """The bus watchdog found nobody."""
@@ -540,8 +539,8 @@ class Servo:
             self._goal_pending = False
             self._memory["Torque Enable"] = 0
 
-    def _strike(self, fault: Fault, moment: float, t: float) -> None:
-        self._faults.remove((fault, moment))
+    def _strike(self, fault: Fault, t: float) -> None:
+        self._faults.remove((fault, t))
         if fault.kind == "stuck":
             self._drive.shaft.seize(t)
         elif fault.kind == "obstacle":

@@ -2,7 +2,7 @@
 
 Sections: kernels (ns per evaluation against C), models (the same for every model, and what it takes to compile all), targets
 (the maps that gonio promises), accuracy (run time against error, gonio and its peers), size (cost against the size of the
-map), start (of the command line), band (of a posterior).
+map), start (of the command line), band (of a posterior), rig (the simulator: motion of a scan, a frame).
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import argparse
 import time
 
-from tests.benchmarks import accuracy, band, kernels, models, page, size, start, targets
+from tests.benchmarks import accuracy, band, kernels, models, page, rig, size, start, targets
 
-SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band")
+SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig")
 INTRODUCTION = """# Benchmarks
 
 What a reflectance map costs, beside what it costs a user who picks something else. All figures of this page are from one
@@ -87,11 +87,13 @@ def main() -> None:
         tell("start", "Start", page.start(started))
     if "band" in chosen:
         tell("band", "Band of a posterior", page.bands([band.measure(l, quick=given.quick) for l in band.LIGHTS]))
+    if "rig" in chosen:
+        tell("rig", "Simulated rig", rig.report(rig.measure(quick=given.quick)))
     if started is not None and found and results:
         tell("verdicts", "Promises", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
     if whole:
         page.picture(results, page.DOCS / page.PICTURE)
-        order = ("verdicts", "accuracy", "targets", "size", "kernels", "models", "start", "band")
+        order = ("verdicts", "accuracy", "targets", "size", "kernels", "models", "start", "band", "rig")
         body = INTRODUCTION.format(machine=machine) + "".join(text[s] for s in order)
         (page.DOCS / "benchmarks.md").write_text(body, encoding="utf-8")
         print(f"\nwrote {page.DOCS / 'benchmarks.md'} and its picture")
