@@ -20,6 +20,7 @@ References
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -71,15 +72,16 @@ def coordinates(omega_i: Array, omega_r: Array) -> Array:
     return np.stack((th, x_2, e[..., 2] ** 2), axis=-1)
 
 
-def grid_position(omega_i: Array, omega_r: Array) -> Array:
-    """Position on the table's axes, each in [0, 1], shape (n, 3)."""
+def grid_position(omega_i: Array, omega_r: Array, shape: tuple[int, int, int], scale: float) -> Array:
+    """Position on the table's axes in numbers of nodes, shape (n, 3)."""
     s, e = omega_i + omega_r, omega_i - omega_r
     length, st = np.linalg.norm(s, axis=-1), np.hypot(s[..., 0], s[..., 1])
     across = np.abs(s[..., 0] * e[..., 1] - s[..., 1] * e[..., 0])
     along = np.abs(e[..., 2]) * length
     total = along + np.hypot(along, across)
     c = np.divide(across, total, out=np.zeros_like(total), where=total > 0)
-    return np.stack((np.sqrt(st / (length + s[..., 2])), np.linalg.norm(e, axis=-1) / (length + 2.0), c), axis=-1)
+    a = np.arcsinh(st / (length + s[..., 2]) / scale) / np.arcsinh(1.0 / scale)  # t = scale sinh(h k)
+    return np.stack((a, np.linalg.norm(e, axis=-1) / (length + 2.0), c), axis=-1) * (np.array(shape) - 1)
 
 
 def regress(
@@ -97,14 +99,7 @@ def regress(
     if not np.any(f > 0):
         raise DatasetError(f"none of the {len(f)} samples is positive; check the dark frames and the quantity")
     u, known = _uncertainty(f, u)
-    position = grid_position(omega_i, omega_r)
-    if len(f) > MANY:
-        x, f, u = _binned(x, f, u, position, shape)
-    data = _Data(x, f, u, known)
-
-    node_i, node_r, below = tabulated.node_directions(shape)
-    targets = coordinates(node_i.reshape(-1, 3), node_r.reshape(-1, 3))
-    chunks = -(-len(targets) // 2048)
+    chunks = -(-math.prod(shape) // 2048)
     total = chunks + 4
 
     def tell(done: int) -> None:
@@ -112,8 +107,18 @@ def regress(
             progress(done, total)
 
     tell(0)
-    settings, scale = _choose(data)
+    some = np.random.default_rng(0).permutation(len(f))[:MANY]
+    settings, scale = _choose(_Data(x[some], f[some], u[some], known))
+    # nodes as dense as the lobe is narrow
+    spread = float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
+    position = grid_position(omega_i, omega_r, shape, spread)
+    data = _Data(x, f, u, known)
+    if len(f) > MANY:
+        data = _Data(*_binned(x, f, u, position, shape), known)
+        settings, scale = _choose(data)
     tell(4)
+    node_i, node_r, below = tabulated.node_directions(shape, spread)
+    targets = coordinates(node_i.reshape(-1, 3), node_r.reshape(-1, 3))
     found = []
     for chunk in range(chunks):
         found.append(data.fit(targets[chunk * 2048 : (chunk + 1) * 2048], settings))
@@ -122,7 +127,7 @@ def regress(
 
     # outside its neighbours, or far from all of them: a straight line only, and an error that grows with the distance
     spacing = data.spacing(targets, settings)
-    cell = tuple(np.rint(position * (np.array(shape) - 1)).astype(np.int64).T)
+    cell = tuple(np.rint(position).astype(np.int64).T)
     measured = np.zeros(shape, dtype=bool)
     measured[cell] = True
     # where azimuth has no meaning, one sample measures the node at all of them
@@ -161,7 +166,7 @@ def regress(
         "fill": "none" if fill is None else repr(fill),
         "uncertainty": "k = 1; random errors, scatter and interpolation; shared errors are not included",
     }
-    return tabulated.TabulatedBRDF(value, value * relative_u, coverage, attributes)
+    return tabulated.TabulatedBRDF(value, value * relative_u, coverage, attributes, spread)
 
 
 class _Data:
@@ -282,11 +287,11 @@ def _choose(data: _Data) -> tuple[Settings, float]:
     least = error(best)
     orders = [(1, 8), (1, 20), (2, 16), (2, 24), (2, 40), (2, 64)]
     ladder: list[dict[str, list[float]] | list[tuple[int, int]]] = [
-        {"c": [0.01, 0.03, 0.3, 1.0]},
+        {"c": [0.001, 0.003, 0.01, 0.03, 0.3, 1.0]},
         orders,
         {"w_1": [0.7, 1.4, 4.0]},
         {"w_3": [0.3, 3.0]},
-        {"c": [0.01, 0.03, 0.06, 0.1, 0.18, 0.3]},
+        {"c": [0.002, 0.005, 0.01, 0.03, 0.06, 0.1, 0.18, 0.3]},
         orders,
     ]
     for rung in ladder:
@@ -305,7 +310,7 @@ def _choose(data: _Data) -> tuple[Settings, float]:
     inside = local.outside < OUTSIDE
     if np.count_nonzero(inside) < FEWEST:
         inside[:] = True
-    low, high = 0.6, 30.0
+    low, high = 0.4, 30.0
     for _ in range(40):
         middle = np.sqrt(low * high)
         pull = deviation / np.sqrt(noise**2 + (middle * mu * local.sigma) ** 2 + 1e-300)
@@ -352,7 +357,7 @@ def _binned(x: Array, f: Array, u: Array, position: Array, shape: tuple[int, int
     size = 0.5
     while True:
         counts = np.ceil((np.array(shape) - 1) / size).astype(np.int64) + 1
-        cell = np.rint(position / size * (np.array(shape) - 1)).astype(np.int64)
+        cell = np.rint(position / size).astype(np.int64)
         key = (cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
         _, inverse = np.unique(key, return_inverse=True)
         groups = int(inverse.max()) + 1

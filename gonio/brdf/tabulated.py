@@ -1,10 +1,12 @@
 r"""A BRDF as a table over Rusinkiewicz's half and difference angles, with an uncertainty and a coverage flag at every node.
 
-Nodes are even steps of :math:`a = \sqrt{\tan(\theta_h/2)}` (quadratic in theta_h near 0, where lobes are narrow), of
-:math:`\tan(\theta_d/2)` and of :math:`\tan(\phi_d/2)`. All three come from lengths of sums and differences of the two unit
-vectors, so a look-up needs square roots and no transcendental function. phi_d is folded into [0, pi/2], which makes
-every table reciprocal and mirror-symmetric by construction. The fourth root of f_r is interpolated by Catmull-Rom cubics,
-once differentiable, and raised again: six decades are one and a half, and no value can be negative.
+With :math:`t = \tan(\theta_h/2)`, nodes stand at :math:`t_k = s\sinh(hk)`, evenly within a lobe of scale s and at even
+ratios beyond it, and at even steps of :math:`\tan(\theta_d/2)` and of :math:`\tan(\phi_d/2)`. All three come from lengths of
+sums and differences of the two unit vectors, and the node below t from a look-up list, so an evaluation needs square roots
+and no transcendental function. phi_d is folded into [0, pi/2], which makes every table reciprocal and mirror-symmetric by
+construction. The fourth root of f_r is interpolated by Catmull-Rom cubics (on uneven nodes: Hermite cubics whose slopes are
+those of parabolas through three nodes), once differentiable, and raised again: six decades are one and a half, and no value
+can be negative.
 
 It refuses anisotropy: phi_h is not a coordinate. Nodes beyond the horizon carry a continuation for the interpolation's
 sake; f_r is 0 there. How scattered samples become nodes is in `gonio.brdf.scattered`.
@@ -34,6 +36,11 @@ from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
 SHAPE = (48, 32, 16)  # nodes along theta_h, theta_d, phi_d
+SCALE = 0.1  # of the nodes along theta_h where nothing is known of a lobe
+LEAST_SCALE = 2e-4
+BUCKETS = 256  # of sqrt(t), each with the first cell that reaches into it
+HEAD = 4 + BUCKETS  # sizes and number of buckets, then the buckets, the cells and the values
+CELL = 18  # numbers of a cell: lower end, 1/width, 4 weights of 4 coefficients
 
 BELOW_HORIZON, MEASURED, INTERPOLATED, EXTRAPOLATED, MODEL = 0, 1, 2, 3, 4
 COVERAGE = {
@@ -54,53 +61,86 @@ def tabulated_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: flo
     sx, sy, sz = xi + xr, yi + yr, zi + zr
     ex, ey, ez = xi - xr, yi - yr, zi - zr
     st2 = sx * sx + sy * sy
-    s, st, e = math.sqrt(st2 + sz * sz), math.sqrt(st2), math.sqrt(ex * ex + ey * ey + ez * ez)
-    a = math.sqrt(st / (s + sz)) * (n_h - 1)  # tan(theta_h / 2) = sin / (1 + cos)
+    s, e = math.sqrt(st2 + sz * sz), math.sqrt(ex * ex + ey * ey + ez * ez)
+    t = math.sqrt(st2) / (s + sz)  # tan(theta_h / 2) = sin / (1 + cos)
     b = e / (s + 2.0) * (n_d - 1)
     # cos phi_d = -e_z |s| / (2 |s_t| sin theta_d), sin phi_d = (s_x e_y - s_y e_x) / (2 |s_t| sin theta_d)
     across, along = 2.0 * abs(xr * yi - xi * yr), abs(ez) * s
     length = along + math.sqrt(along * along + across * across)
     c = across / length * (n_p - 1) if length > 0.0 else 0.0
 
-    i, j, k = min(int(a), n_h - 2), min(int(b), n_d - 2), min(int(c), n_p - 2)
-    u, v, w = a - i, b - j, c - k
+    i = int(p[4 + min(int(math.sqrt(t) * BUCKETS), BUCKETS - 1)])
+    while i < n_h - 2 and t > p[HEAD + CELL * (i + 1)]:
+        i += 1
+    at = HEAD + CELL * i
+    u = (t - p[at]) * p[at + 1]
+    j, k = min(int(b), n_d - 2), min(int(c), n_p - 2)
+    v, w = b - j, c - k
+    v0, v1, v2, v3 = _weights(v)
+    w0, w1, w2, w3 = _weights(w)
+    # the table has a row of mirrored nodes before its first and after its last one, so all 64 values are there
+    plane, row = (n_d + 2) * (n_p + 2), n_p + 2
+    first = HEAD + CELL * (n_h - 1) + i * plane + j * row + k
     q = 0.0
     for m in range(4):
-        ii = i + m - 1  # the function is even about theta_h = 0, theta_d = 0, phi_d = 0 and phi_d = pi/2
-        ii = 1 if ii < 0 else min(ii, n_h - 1)
-        row = 0.0
-        for n in range(4):
-            jj = j + n - 1
-            jj = 1 if jj < 0 else min(jj, n_d - 1)
-            at = 3 + (ii * n_d + jj) * n_p + k
-            before = p[at - 1] if k > 0 else p[at + 1]
-            after = p[at + 2] if k < n_p - 2 else p[at]
-            row += _weight(n, v) * (
-                _weight(0, w) * before + _weight(1, w) * p[at] + _weight(2, w) * p[at + 1] + _weight(3, w) * after
-            )
-        q += _weight(m, u) * row
+        g = at + 2 + 4 * m
+        weight = p[g] + u * (p[g + 1] + u * (p[g + 2] + u * p[g + 3]))
+        x = first + m * plane
+        r0 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
+        x += row
+        r1 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
+        x += row
+        r2 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
+        x += row
+        r3 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
+        q += weight * (v0 * r0 + v1 * r1 + v2 * r2 + v3 * r3)
     q = max(q, 0.0)
     q *= q
     return q * q
 
 
 @jit.model
-def _weight(m: int, t: float) -> float:
-    """Catmull-Rom weight of node m - 1 at fraction t between nodes 0 and 1."""
-    if m == 0:
-        return t * (-0.5 + t * (1.0 - 0.5 * t))
-    if m == 1:
-        return 1.0 + t * t * (1.5 * t - 2.5)
-    if m == 2:
-        return t * (0.5 + t * (2.0 - 1.5 * t))
-    return t * t * (0.5 * t - 0.5)
+def _weights(t: float) -> tuple[float, float, float, float]:
+    """Catmull-Rom weights of four even nodes at fraction t between the middle two."""
+    return (
+        t * (-0.5 + t * (1.0 - 0.5 * t)),
+        1.0 + t * t * (1.5 * t - 2.5),
+        t * (0.5 + t * (2.0 - 1.5 * t)),
+        t * t * (0.5 * t - 0.5),
+    )
+
+
+def _cells(t: Array) -> Array:
+    """Lower end, 1/width and the 4 x 4 coefficients of the weights of the nodes around each cell, shape (n - 1, CELL).
+
+    The function is even about t = 0 and level beyond the last node.
+    """
+    before, after = np.concatenate(([-t[1]], t[:-2])), np.concatenate((t[2:], [2 * t[-1] - t[-2]]))
+    low, high = t[:-1], t[1:]
+    d0, d1, d2 = low - before, high - low, after - high
+    zero, one = np.zeros_like(d1), np.ones_like(d1)
+    # slopes times the width at both ends, of parabolas through three nodes, as weights of the four
+    left = np.stack((-d1 * d1 / (d0 * (d0 + d1)), (d1 - d0) / d0, d0 / (d0 + d1), zero))
+    right = np.stack((zero, -d2 / (d1 + d2), (d2 - d1) / d2, d1 * d1 / (d2 * (d1 + d2))))
+    values = np.stack((zero, one, zero, zero)), np.stack((zero, zero, one, zero))
+    # Hermite: f_1 + left u + (3 (f_2 - f_1) - 2 left - right) u^2 + (2 (f_1 - f_2) + left + right) u^3
+    rise = values[1] - values[0]
+    coefficients = np.stack((values[0], left, 3 * rise - 2 * left - right, left + right - 2 * rise), axis=1)  # (4, 4, n - 1)
+    return np.concatenate((low[:, None], 1.0 / d1[:, None], coefficients.reshape(16, -1).T), axis=1)
+
+
+def _buckets(t: Array) -> Array:
+    """For each even step of sqrt(t) the cell that holds its beginning."""
+    start = (np.arange(BUCKETS) / BUCKETS) ** 2
+    return np.clip(np.searchsorted(t, start * (1 - 1e-12), side="right") - 1, 0, len(t) - 2).astype(float)
 
 
 def _lobe_width(packed: Array) -> float:
     """Half width [rad] in theta_h of the narrowest peak around theta_h = 0; 1 where no column has one."""
     n_h, n_d, n_p = (int(n) for n in packed[:3])
-    f = packed[3:].reshape(n_h, n_d, n_p) ** 4
-    theta_h = 2.0 * np.arctan(np.linspace(0.0, 1.0, n_h) ** 2)
+    t = np.append(packed[HEAD : HEAD + CELL * (n_h - 1) : CELL], 1.0)
+    f = packed[HEAD + CELL * (n_h - 1) :].reshape(n_h + 2, n_d + 2, n_p + 2)[1:-1, 1:-1, 1:-1] ** 4
+    theta_h = 2.0 * np.arctan(t)
     width = 1.0
     for j in range(n_d // 2):  # theta_d up to about 53 degrees: beyond, the horizon cuts the lobe
         column = f[:, j, n_p - 1]  # phi_d = 90 degrees: above the horizon at any theta_h
@@ -113,7 +153,7 @@ def _lobe_width(packed: Array) -> float:
 
 TABULATED = Model(
     name="tabulated",
-    parameters=(),  # the parameter array is the packed table: three sizes, then the fourth roots of f_r
+    parameters=(),  # the parameter array is the packed table
     function=tabulated_f_r,
     doc="Table over half and difference angles, cubic in the fourth root of f_r.",
     reference="Rusinkiewicz, Eurographics Workshop on Rendering, 1998",
@@ -123,11 +163,25 @@ TABULATED = Model(
 )
 
 
-def nodes(shape: tuple[int, int, int] = SHAPE) -> tuple[Array, Array, Array]:
-    """Node angles theta_h, theta_d, phi_d of a table of that shape [rad]; phi_d in [0, pi/2]."""
+def nodes(shape: tuple[int, int, int] = SHAPE, scale: float = SCALE) -> tuple[Array, Array, Array]:
+    """Node angles theta_h, theta_d, phi_d of a table of that shape and scale of theta_h [rad]; phi_d in [0, pi/2]."""
     check_shape(shape)
-    a, b, c = (np.linspace(0.0, 1.0, n) for n in shape)
-    return 2.0 * np.arctan(a * a), 2.0 * np.arctan(b), 2.0 * np.arctan(c)
+    _, b, c = (np.linspace(0.0, 1.0, n) for n in shape)
+    return 2.0 * np.arctan(tangents(shape[0], scale)), 2.0 * np.arctan(b), 2.0 * np.arctan(c)
+
+
+def tangents(n: int, scale: float) -> Array:
+    """The n nodes of t = tan(theta_h / 2), from 0 to 1."""
+    if not LEAST_SCALE <= scale <= 10.0:
+        raise DatasetError(f"a table whose nodes have the scale {scale:g}: it must be from {LEAST_SCALE:g} to 10")
+    t = scale * np.sinh(np.linspace(0.0, math.asinh(1.0 / scale), n))
+    t[0], t[-1] = 0.0, 1.0
+    return t
+
+
+def scale_for(lobe_width: float | None) -> float:
+    """Scale of the nodes for a lobe of that half width in half-vector angle [rad]: a third of it, in t."""
+    return SCALE if lobe_width is None else float(np.clip(lobe_width / 6.0, LEAST_SCALE, 0.3))
 
 
 def check_shape(shape: tuple[int, ...]) -> None:
@@ -139,7 +193,7 @@ def check_shape(shape: tuple[int, ...]) -> None:
         )
 
 
-def node_directions(shape: tuple[int, int, int] = SHAPE) -> tuple[Array, Array, NDArray[np.bool_]]:
+def node_directions(shape: tuple[int, int, int] = SHAPE, scale: float = SCALE) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Directions at which the nodes stand.
 
     Returns
@@ -150,7 +204,7 @@ def node_directions(shape: tuple[int, int, int] = SHAPE) -> tuple[Array, Array, 
     below : ndarray of bool, shape (*shape)
         The node itself is at or below the horizon.
     """
-    theta_h, theta_d, phi_d = np.meshgrid(*nodes(shape), indexing="ij")
+    theta_h, theta_d, phi_d = np.meshgrid(*nodes(shape, scale), indexing="ij")
     lowest = math.sin(math.radians(1.0))
 
     def height(t: Array) -> Array:  # the smaller of cos theta_i and cos theta_r
@@ -184,15 +238,19 @@ class TabulatedBRDF:
     coverage : ndarray of uint8, same shape
         Keys of `COVERAGE`: 0 below the horizon, 1 measured, 2 interpolated, 3 extrapolated, 4 from a fitted model.
     attributes : mapping of str to str
+    scale : float
+        Of the nodes along theta_h; `scale_for` a lobe.
     """
 
     value: Array
     u: Array
     coverage: NDArray[np.uint8]
     attributes: Mapping[str, str] = field(default_factory=dict)
+    scale: float = SCALE
 
     def __post_init__(self) -> None:
         check_shape(self.value.shape)
+        tangents(self.value.shape[0], self.scale)
         for name, array in (("u", self.u), ("coverage", self.coverage)):
             if array.shape != self.value.shape:
                 raise DatasetError(f"table: {name} has shape {array.shape}, value has {self.value.shape}")
@@ -211,15 +269,33 @@ class TabulatedBRDF:
 
     def nodes(self) -> tuple[Array, Array, Array]:
         """Node angles theta_h, theta_d, phi_d [rad]."""
-        return nodes(self.shape)
+        return nodes(self.shape, self.scale)
 
     def brdf(self) -> BRDF:
         """The table as a BRDF of one term, for evaluation and for the integrator."""
-        return _packed(self.value)
+        return _packed(self.value, self.scale)
 
     def u_brdf(self) -> BRDF:
         """The table's uncertainty, to be evaluated as a BRDF is [1/sr]."""
-        return _packed(np.nan_to_num(self.u))
+        return _packed(np.nan_to_num(self.u), self.scale)
+
+    def coverage_at(self, omega_i: Array, omega_r: Array) -> NDArray[np.uint8]:
+        """Coverage flag at pairs of directions (..., 3): that of the nearest node, below the horizon 0.
+
+        A direction next to a node that was measured, though not at it, is interpolated.
+        """
+        from gonio.brdf.scattered import grid_position
+
+        wi, wr = np.broadcast_arrays(np.asarray(omega_i, dtype=float), np.asarray(omega_r, dtype=float))
+        position = grid_position(wi.reshape(-1, 3), wr.reshape(-1, 3), self.shape, self.scale)
+        nearest = tuple(np.rint(position).astype(np.int64).T)
+        found = self.coverage[nearest].copy()
+        apart = np.max(np.abs(position - np.rint(position)), axis=1) > 0.1
+        found[(found == MEASURED) & apart] = INTERPOLATED
+        up = (wi.reshape(-1, 3)[:, 2] > 0) & (wr.reshape(-1, 3)[:, 2] > 0)
+        found[up & (found == BELOW_HORIZON)] = EXTRAPOLATED  # between the horizon and the first node above it
+        found[~up] = BELOW_HORIZON
+        return found.reshape(wi.shape[:-1])
 
     def counts(self) -> dict[str, int]:
         """Number of nodes by coverage."""
@@ -227,7 +303,7 @@ class TabulatedBRDF:
 
     def samples(self) -> BRDFSamples:
         """The nodes above the horizon as samples, without those that were extrapolated or taken from a model."""
-        omega_i, omega_r, _ = node_directions(self.shape)
+        omega_i, omega_r, _ = node_directions(self.shape, self.scale)
         known = (self.coverage == MEASURED) | (self.coverage == INTERPOLATED)
         wi, wr = omega_i[known], omega_r[known]
         theta_i, theta_r = (np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]) for w in (wi, wr))
@@ -252,17 +328,29 @@ class TabulatedBRDF:
         return netcdf.read_table(Path(path))
 
 
-def _packed(f: Array) -> BRDF:
+def _packed(f: Array, scale: float) -> BRDF:
     root = np.sqrt(np.sqrt(f))
-    return BRDF([Term(TABULATED, np.concatenate((np.array(f.shape, dtype=float), root.ravel())))])
+    # mirrored nodes around: even about theta_h = 0, theta_d = 0, phi_d = 0 and phi_d = pi/2, level beyond the others
+    root = np.concatenate((root[1:2], root, root[-1:]), axis=0)
+    root = np.concatenate((root[:, 1:2], root, root[:, -1:]), axis=1)
+    root = np.concatenate((root[:, :, 1:2], root, root[:, :, -2:-1]), axis=2)
+    t = tangents(f.shape[0], scale)
+    head = np.array([*f.shape, BUCKETS], dtype=float)
+    return BRDF([Term(TABULATED, np.concatenate((head, _buckets(t), _cells(t).ravel(), root.ravel())))])
 
 
-def from_brdf(brdf: BRDF, shape: tuple[int, int, int] = SHAPE) -> TabulatedBRDF:
-    """The table of a BRDF that is known everywhere: every node above the horizon counts as taken from a model."""
-    omega_i, omega_r, below = node_directions(shape)
+def from_brdf(brdf: BRDF, shape: tuple[int, int, int] = SHAPE, scale: float | None = None) -> TabulatedBRDF:
+    """The table of a BRDF that is known everywhere: every node above the horizon counts as taken from a model.
+
+    Nodes follow the narrowest lobe that a term declares, unless a scale is given.
+    """
+    if scale is None:
+        widths = [w for w in (term.lobe_width() for term in brdf.terms) if w is not None]
+        scale = scale_for(min(widths, default=None))
+    omega_i, omega_r, below = node_directions(shape, scale)
     value = brdf.evaluate(omega_i, omega_r)
     coverage = np.where(below, BELOW_HORIZON, MODEL).astype(np.uint8)
-    return TabulatedBRDF(value, np.zeros(shape), coverage, {"quantity": "brdf", "source": repr(brdf)})
+    return TabulatedBRDF(value, np.zeros(shape), coverage, {"quantity": "brdf", "source": repr(brdf)}, scale)
 
 
 def tabulate(

@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -172,14 +173,18 @@ def _table(path: Path, file: Contents) -> TabulatedBRDF:
     u = _array(path, file, "brdf_table_standard_error")
     coverage = _array(path, file, "brdf_table_coverage", kind="iu")
     tabulated.check_shape(value.shape)
-    for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape), strict=True):
+    try:
+        scale = float(file.attributes["brdf_table"].get("theta_h_scale", "nan"))
+    except ValueError:
+        scale = math.nan
+    for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape, scale), strict=True):
         axis = _array(path, file, name)
         if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
             raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
     attributes = _attributes(path, file, "brdf_table")
     if np.any((coverage < 0) | (coverage > 255)):
         raise DatasetError(f"{path}: a coverage flag is outside 0 to 255; the file is damaged")
-    return tabulated.TabulatedBRDF(value, u, coverage.astype(np.uint8), attributes)
+    return tabulated.TabulatedBRDF(value, u, coverage.astype(np.uint8), attributes, scale)
 
 
 def _put_samples(file: Any, samples: BRDFSamples | ChannelSamples) -> None:
@@ -242,7 +247,7 @@ def _put_table(file: Any, table: TabulatedBRDF) -> None:
         file, "brdf_table", dimensions, table.value, long_name=BRDF_NAME, units="sr-1",
         ancillary_variables="brdf_table_standard_error brdf_table_coverage",
         comment="phi_d is folded into 0..pi/2: reciprocal and mirror-symmetric; beyond the horizon a continuation",
-        gonio_attributes=json.dumps(dict(table.attributes), sort_keys=True),
+        theta_h_scale=repr(float(table.scale)), gonio_attributes=json.dumps(dict(table.attributes), sort_keys=True),
     )  # fmt: skip
     _variable(
         file, "brdf_table_standard_error", dimensions, table.u, units="sr-1",

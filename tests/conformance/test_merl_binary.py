@@ -157,7 +157,7 @@ def test_read_gives_scattered_samples_of_the_truth(file: Path, truth: gonio.BRDF
 def test_file_to_table(file: Path, truth: gonio.BRDF) -> None:
     """What `gonio import` and `gonio table` make of a MERL file."""
     table = tabulate(formats.read_samples(file))
-    omega_i, omega_r, _ = node_directions(table.shape)
+    omega_i, omega_r, _ = node_directions(table.shape, table.scale)
     known = (table.coverage == 1) | (table.coverage == 2)
     error = np.abs(table.value / truth.evaluate(omega_i, omega_r) - 1)[known]
     assert np.median(error) < 0.005 and np.quantile(error, 0.9) < 0.05

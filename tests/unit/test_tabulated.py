@@ -56,7 +56,7 @@ def test_grid_position_of_the_nodes_is_their_number() -> None:
     omega_i, omega_r, below = node_directions(SHAPE)
     inside = ~below
     inside[0], inside[:, 0] = False, False  # there phi_d has no meaning
-    position = scattered.grid_position(omega_i[inside], omega_r[inside]) * (np.array(SHAPE) - 1)
+    position = scattered.grid_position(omega_i[inside], omega_r[inside], SHAPE, tabulated.SCALE)
     np.testing.assert_allclose(position, np.argwhere(inside), atol=1e-6)
 
 
@@ -66,9 +66,9 @@ def test_coordinates_against_half_difference_angles() -> None:
     wi = gonio.geometry.unit_vector(theta_i, 0.0)
     wr = gonio.geometry.unit_vector(theta_r, rng.uniform(0, 2 * np.pi, 500))
     theta_h, _, theta_d, phi_d = half_difference(wi, wr)
-    position = scattered.grid_position(wi, wr)
+    position = scattered.grid_position(wi, wr, (2, 2, 2), 0.05)
     folded = np.abs(np.mod(phi_d + np.pi / 2, np.pi) - np.pi / 2)
-    np.testing.assert_allclose(position[:, 0] ** 2, np.tan(theta_h / 2), rtol=1e-12)
+    np.testing.assert_allclose(0.05 * np.sinh(position[:, 0] * np.arcsinh(20.0)), np.tan(theta_h / 2), rtol=1e-12)
     np.testing.assert_allclose(position[:, 1], np.tan(theta_d / 2), rtol=1e-12)
     np.testing.assert_allclose(position[:, 2], np.tan(folded / 2), atol=1e-9)
 
@@ -86,7 +86,7 @@ def test_interpolation_between_the_nodes(alpha: float, most: float) -> None:
 
 def test_nodes_are_reproduced() -> None:
     table = from_brdf(material())
-    omega_i, omega_r, below = node_directions(table.shape)
+    omega_i, omega_r, below = node_directions(table.shape, table.scale)
     found = table.brdf().evaluate(omega_i[~below], omega_r[~below])
     np.testing.assert_allclose(found, table.value[~below], rtol=1e-9)
 
@@ -126,7 +126,7 @@ def test_table_from_a_scan_predicts_what_was_held_out(scan_table: TabulatedBRDF)
 
 
 def test_extrapolated_nodes_are_flagged_and_know_little(scan_table: TabulatedBRDF) -> None:
-    omega_i, omega_r, _ = node_directions(scan_table.shape)
+    omega_i, omega_r, _ = node_directions(scan_table.shape, scan_table.scale)
     theta_i, theta_r = np.arccos(omega_i[..., 2]), np.arccos(omega_r[..., 2])
     far = (np.minimum(theta_i, theta_r) > math.radians(84)) & (scan_table.coverage != tabulated.BELOW_HORIZON)
     assert np.all(scan_table.coverage[far] == tabulated.EXTRAPOLATED)
@@ -149,7 +149,7 @@ def test_holes_come_from_the_model_that_fills() -> None:
     table = tabulate(measured(truth, 150, seed=5), fill=truth)
     holes = table.coverage == tabulated.MODEL
     assert np.any(holes) and not np.any(table.coverage == tabulated.EXTRAPOLATED)
-    omega_i, omega_r, _ = node_directions(table.shape)
+    omega_i, omega_r, _ = node_directions(table.shape, table.scale)
     np.testing.assert_array_equal(table.value[holes], truth.evaluate(omega_i[holes], omega_r[holes]))
     assert np.all(table.u[holes] > 0)
 
@@ -250,10 +250,49 @@ def test_tables_add_and_scale_as_brdfs_do() -> None:
     assert float(both.f_r(0.5, 0, 0.3, 2.0)) == pytest.approx(expected, rel=1e-12)
 
 
-def test_node_angles_are_dense_where_lobes_are() -> None:
-    theta_h, theta_d, phi_d = nodes()
-    assert theta_h[1] < math.radians(0.1) and theta_h[-1] == pytest.approx(np.pi / 2)
-    assert theta_d[-1] == pytest.approx(np.pi / 2) and phi_d[-1] == pytest.approx(np.pi / 2)
+def test_node_angles_are_dense_where_the_lobe_is() -> None:
+    """Eight nodes at least within the half width of any lobe, from a broad one to a tenth of a degree."""
+    for alpha in (0.3, 0.1, 0.01, 0.002):
+        table = from_brdf(material(alpha))
+        theta_h, theta_d, phi_d = table.nodes()
+        half_width = math.atan(alpha * math.sqrt(math.sqrt(2.0) - 1.0))
+        assert np.count_nonzero(theta_h < half_width) >= 4
+        assert theta_h[0] == 0 and theta_h[-1] == pytest.approx(np.pi / 2)
+        assert theta_d[-1] == pytest.approx(np.pi / 2) and phi_d[-1] == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.01, 0.002])
+def test_lobe_of_a_tenth_of_a_degree_between_the_nodes(alpha: float) -> None:
+    truth = material(alpha)
+    rng = np.random.default_rng(5)
+    theta_i = rng.uniform(0, math.radians(75), 3000)
+    theta_r = np.clip(theta_i + alpha * rng.standard_normal(3000), 0, math.radians(80))
+    phi_r = np.pi + alpha * rng.standard_normal(3000)
+    found, expected = from_brdf(truth).brdf().f_r(theta_i, 0, theta_r, phi_r), truth.f_r(theta_i, 0, theta_r, phi_r)
+    assert expected.max() / expected.min() > 100
+    assert np.abs(found / expected - 1).max() < 6e-3
+
+
+def test_once_differentiable_across_the_cells() -> None:
+    """Along a line through many cells a kink would be a jump of the first difference; here they shrink with the step."""
+    brdf = from_brdf(material(0.05), (24, 16, 8)).brdf()
+    x = np.linspace(0.05, 1.3, 20_001)
+    f = np.log(brdf.f_r(0.6, 0.0, x, np.pi + 0.1 + 0.2 * x))
+    slope = np.diff(f) / np.diff(x)
+    jump, finer = np.abs(np.diff(slope)).max(), np.abs(np.diff(slope[::4])).max()
+    assert finer / jump > 3.0  # a kink's jump would not depend on the step
+
+
+def test_coverage_at_any_direction(scan_table: TabulatedBRDF) -> None:
+    omega_i, omega_r, below = node_directions(scan_table.shape, scan_table.scale)
+    inside = ~below
+    inside[0], inside[:, 0] = False, False  # there phi_d has no meaning
+    found = scan_table.coverage_at(omega_i[inside], omega_r[inside])
+    np.testing.assert_array_equal(found, scan_table.coverage[inside])
+    up, down = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.0, -0.8])
+    assert int(scan_table.coverage_at(up, down)) == tabulated.BELOW_HORIZON
+    near = np.array([math.sin(1.56), 0.0, math.cos(1.56)])
+    assert int(scan_table.coverage_at(near, near * [-1, 1, 1])) == tabulated.EXTRAPOLATED
 
 
 def test_samples_of_a_table_leave_out_what_was_not_measured(scan_table: TabulatedBRDF) -> None:
