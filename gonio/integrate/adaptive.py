@@ -163,6 +163,7 @@ class _Block:
         self.term, self.fixed, self.light, self.names = term, np.ascontiguousarray(fixed), light, names
         self.reverse, self.effort = reverse, effort
         self.width = term.lobe_width()
+        self.rounding = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0)) + edge_rounding(region.axis[:, 2], region.half_angle)
         n, axis = len(fixed), np.ascontiguousarray(region.axis)
         planes, counts = _planes(term, fixed, region, light)
         self.frames, self.circles = np.empty((n, 3, 3)), np.empty((n, planes.shape[1], 3))
@@ -241,8 +242,7 @@ class _Block:
             if not np.any(split):
                 if self.term.model.pieces:
                     total, missing = self._confirm(total)
-                relative = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0))
-                return total, missing + relative * np.abs(total)
+                return total, missing + self.rounding * np.abs(total)
             ways = np.where(along > 4 * across, 1, np.where(across > 4 * along, 2, 3)) * split
             keep = ~split
             base, box = _halve(self.base[split], self.box[split], ways[split])
@@ -286,6 +286,18 @@ class _Block:
             out[:, part] = best, _SAFETY * np.abs(best - sums[:, 1, 0]), _SAFETY * np.abs(best - sums[:, 0, 1])
             self.effort.add(f_r.size, side)
         return out[0], out[1], out[2]
+
+
+def edge_rounding(height: Array, half_angle: float) -> Array:
+    """Relative rounding error of a cap's edges: 1 eps of an angle is eps / sine of a small cap, or of what a horizon leaves.
+
+    `height` is the cosine of each cap's axis from the normal, shape (n,).
+    """
+    if half_angle >= math.pi / 2:
+        return np.zeros(len(height))
+    sine = math.sin(half_angle)
+    left = np.minimum(np.abs(height + sine), sine)
+    return np.asarray(4.0 * EPS * (1.0 / np.maximum(left, EPS) + 1.0 / sine))
 
 
 def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tuple[Array, Index]:

@@ -21,6 +21,7 @@ from gonio import jit
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
 from gonio.integrate import threads as tiling
+from gonio.integrate.adaptive import edge_rounding
 from gonio.integrate.cap import NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.integrate.lights import over_cap
@@ -191,12 +192,7 @@ def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
 def _rounding(scene: _Scene) -> Array:
     """Relative rounding error of the sums: 1 eps of a direction is eps / width of a lobe, or of what a horizon leaves."""
     width = scene.width * np.maximum(scene.cos_n, min(scene.width, 1.0))
-    rounding = 4.0 * EPS * (1.0 + 1.0 / width)
-    if scene.cap.half_angle < math.pi / 2:
-        sine = math.sin(scene.cap.half_angle)
-        height = np.minimum(np.abs(scene.axis[:, 2] + sine), sine)
-        rounding += 4.0 * EPS * (1.0 / np.maximum(height, EPS) + 1.0 / sine)
-    return rounding
+    return np.asarray(4.0 * EPS * (1.0 + 1.0 / width) + edge_rounding(scene.axis[:, 2], scene.cap.half_angle))
 
 
 def _first_orders(scene: _Scene, rtol: float) -> NDArray[np.intp]:
