@@ -96,7 +96,7 @@ def measure(run: Run, output: Output) -> None:
             result = scan(run, rig, progress=progress)
     output.say(f"{result.done} of {result.poses} poses taken in {result.seconds:.0f} s by the rig's clock")
     if result.repeated:
-        output.say(f"{result.repeated} exposures were taken again because an axis moved")
+        output.say(f"{result.repeated} exposures were taken again because an axis moved or a frame was old")
     if result.saturated:
         output.warn(f"{len(result.saturated)} poses are saturated in every exposure; shorten exposures_s")
     output.result(run=run.path, poses=result.poses, taken=result.done, saturated=list(result.saturated))

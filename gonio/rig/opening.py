@@ -343,7 +343,7 @@ def _in_process(config: RigConfig, sim: SimConfig, stack: ExitStack, faults: boo
     lamp = ScpiLamp(urls["lamp"], baud=config.lamp.baud, timeout_s=config.lamp.timeout_s, now=clock.now)
     stack.callback(lamp.close)
     bus = Bus(urls["bus"], clock=clock, baud=config.bus.baud, timeout_s=config.bus.timeout_s, now=clock.now)
-    axes = _connect(bus, config, stack)
+    axes = _connect(bus, config, stack, watchdog_s=config.bus.watchdog_s or None)
     camera = simulation.camera
     return Rig(config, clock, bus, axes, camera, lamp, camera.mount, camera.truth)
 

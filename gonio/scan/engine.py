@@ -76,7 +76,7 @@ class ScanResult:
     saturated : tuple of int
         Poses of the run without a single exposure free of saturation.
     repeated : int
-        Exposures of this session that were taken again because an axis moved.
+        Exposures of this session that were taken again, because an axis moved or a frame was an old one.
     seconds : float
         Rig time of this session [s].
     """
@@ -356,6 +356,6 @@ class _Scan:
             poses=len(self._plan.poses),
             done=self._done,
             saturated=tuple(p.index for p in self._run.poses() if "saturated" in p.flags),
-            repeated=self._repeated,
+            repeated=self._repeated + self._exposer.retaken,
             seconds=self._rig.clock.now() - self._start_s,
         )

@@ -16,6 +16,8 @@ from gonio.interfaces import Camera, Frame
 _SAME = 0.1  # relative; cameras set exposures in steps
 _DARK_SIGMAS = 5.0
 _LEAST_SIGMA_DN = 0.3  # of a rounded count
+_TRIES = 3
+_NOISY_VALUES = 8  # in a row whose repetition is no chance: darks of 8 bits and saturated rows have fewer
 
 
 class Exposer:
@@ -30,6 +32,11 @@ class Exposer:
         x0, y0, width, height [pixel].
     check_stop : callable
         Raises if the scan is to stop.
+
+    Attributes
+    ----------
+    retaken : int
+        Frames that held rows of the one before.
     """
 
     def __init__(
@@ -43,6 +50,8 @@ class Exposer:
         self._camera = camera
         self._roi = roi
         self._check_stop = check_stop
+        self._last: NDArray[np.uint16] | None = None
+        self.retaken = 0
 
     def bracket(self, label: str) -> list[Frame]:
         """One frame of each exposure, labelled ``"<label> exposure <e>"``."""
@@ -51,16 +60,31 @@ class Exposer:
     def capture(self, exposure: int, label: str) -> Frame:
         """A frame of the bracket's exposure of that number.
 
+        Noise makes no two rows alike; a frame with rows of the one before, repeated or torn, is taken again.
+
         Raises
         ------
         DeviceError
             If the camera fails.
         MeasurementError
-            If it exposes otherwise than told, or the region of interest lies outside the frame.
+            If it exposes otherwise than told, sends old rows again and again, or the region of interest lies outside the
+            frame.
         """
-        self._check_stop()
-        exposure_s = self.exposures_s[exposure]
-        frame = self._camera.capture(exposure_s, label=label)
+        for _ in range(_TRIES):
+            self._check_stop()
+            frame = self._camera.capture(self.exposures_s[exposure], label=label)
+            self._check(frame, self.exposures_s[exposure], label)
+            old = _old_rows(frame.data, self._last)
+            if not old:
+                self._last = frame.data
+                return frame
+            self.retaken += 1
+        raise MeasurementError(
+            f"{label}: {old} of {len(frame.data)} rows of the frame are those of the frame before, to the last bit, "
+            f"{_TRIES} times; see the camera's cable and driver"
+        )
+
+    def _check(self, frame: Frame, exposure_s: float, label: str) -> None:
         if not abs(frame.exposure_s - exposure_s) <= _SAME * exposure_s:
             raise MeasurementError(
                 f"{label}: the camera exposed for {frame.exposure_s:g} s instead of {exposure_s:g} s; choose exposures_s "
@@ -73,7 +97,6 @@ class Exposer:
                 f"{label}: the frame has {columns} x {rows} pixels, the region of interest {list(self._roi)} does not lie "
                 "within it; correct roi in rig.toml"
             )
-        return frame
 
     def saturated(self, frames: Sequence[Frame]) -> bool:
         """Whether none of the frames is free of saturated pixels in the region of interest."""
@@ -96,3 +119,11 @@ class Exposer:
     def _region(self, frame: Frame) -> NDArray[np.uint16]:
         x0, y0, width, height = self._roi
         return frame.data[y0 : y0 + height, x0 : x0 + width]
+
+
+def _old_rows(data: NDArray[np.uint16], before: NDArray[np.uint16] | None) -> int:
+    """Rows that are those of the frame before, to the last bit, and have enough noise for that to mean something."""
+    if before is None or before.shape != data.shape:
+        return 0
+    same = np.flatnonzero((data == before).all(axis=1))
+    return sum(len(np.unique(data[row])) >= _NOISY_VALUES for row in same)
