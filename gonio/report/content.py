@@ -43,7 +43,10 @@ UNCERTAINTY = (
 
 
 def brdf_from(values: Mapping[str, float]) -> BRDF | None:
-    """The BRDF of qualified parameter values such as ``{"lambertian.albedo": 0.5, ...}``; None if they name no model."""
+    """The BRDF of qualified parameter values such as ``{"lambertian.albedo": 0.5, ...}``.
+
+    None if they name no model, or one that comes in several forms, which the names do not tell apart.
+    """
     terms: dict[str, dict[str, float]] = {}
     known = brdf_models.models()
     for name, value in values.items():
@@ -53,7 +56,7 @@ def brdf_from(values: Mapping[str, float]) -> BRDF | None:
     built: BRDF | None = None
     for term, parameters in terms.items():
         model = known[term.rstrip("0123456789")]
-        if {p.name for p in model.parameters} != set(parameters):
+        if {p.name for p in model.parameters} != set(parameters) or brdf_models.families.find(model.name).choices:
             return None  # a truth with a parameter missing is no truth
         one = brdf_models.make(model.name, **parameters)
         built = one if built is None else built + one

@@ -353,6 +353,7 @@ def test_truth_is_drawn_only_if_it_is_complete() -> None:
     whole = content.brdf_from(TRUTH)
     assert whole is not None and whole.parameters() == {n: v for n, v in TRUTH.items() if not n.startswith("shared.")}
     assert content.brdf_from({"ggx.alpha": 0.2}) is None
+    assert content.brdf_from({"oren_nayar.albedo": 0.5, "oren_nayar.sigma": 0.3}) is None  # of two variants
     assert content.brdf_from({"shared.scale": 0.004}) is None
 
 
