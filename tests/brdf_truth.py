@@ -191,6 +191,7 @@ def _where(wi: Array, wr: Array) -> str:
 # --- properties -----------------------------------------------------------------------------------------------------------
 
 
+@functools.lru_cache(maxsize=256)
 def random_pairs(count: int, seed: int) -> tuple[Array, Array]:
     """Random directions of the whole sphere, many of them near the horizon, the normal, the mirror and each other."""
     rng = np.random.default_rng(seed)
