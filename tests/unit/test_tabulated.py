@@ -11,7 +11,7 @@ import pytest
 import gonio
 from gonio import formats
 from gonio.brdf import scattered, tabulated
-from gonio.brdf.tabulated import SHAPE, TabulatedBRDF, from_brdf, node_directions, nodes, tabulate
+from gonio.brdf.tabulated import SHAPE, TabulatedBRDF, from_brdf, node_directions, tabulate
 from gonio.errors import DatasetError
 from gonio.halfdiff import half_difference
 from gonio.samples import BRDFSamples
