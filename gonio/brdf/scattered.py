@@ -81,7 +81,7 @@ def grid_position(omega_i: Array, omega_r: Array, shape: tuple[int, int, int], s
     total = along + np.hypot(along, across)
     c = np.divide(across, total, out=np.zeros_like(total), where=total > 0)
     a = np.arcsinh(st / (length + s[..., 2]) / scale) / np.arcsinh(1.0 / scale)  # t = scale sinh(h k)
-    return np.stack((a, np.linalg.norm(e, axis=-1) / (length + 2.0), c), axis=-1) * (np.array(shape) - 1)
+    return np.asarray(np.stack((a, np.linalg.norm(e, axis=-1) / (length + 2.0), c), axis=-1) * (np.array(shape) - 1))
 
 
 def regress(

@@ -295,7 +295,7 @@ class TabulatedBRDF:
         up = (wi.reshape(-1, 3)[:, 2] > 0) & (wr.reshape(-1, 3)[:, 2] > 0)
         found[up & (found == BELOW_HORIZON)] = EXTRAPOLATED  # between the horizon and the first node above it
         found[~up] = BELOW_HORIZON
-        return found.reshape(wi.shape[:-1])
+        return np.asarray(found.reshape(wi.shape[:-1]))
 
     def counts(self) -> dict[str, int]:
         """Number of nodes by coverage."""
