@@ -65,7 +65,7 @@ def main() -> None:
     print(machine)
     tell("kernels", "One evaluation", page.kernels(speeds))
     if "models" in chosen:
-        tell("models", "Every model", models.report(models.measure(), *models.compile_cold()))
+        tell("models", "Every model", models.report(models.measure(), models.compile_cold()))
     found, results, costs, started = [], [], {}, None
     if "targets" in chosen:
         found = list(targets.measure(quick=given.quick))
