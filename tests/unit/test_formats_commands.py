@@ -1,0 +1,117 @@
+"""gonio info, convert, check-file, export, bundle on small files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gonio import formats
+from gonio.cli.main import main
+from gonio.formats import opticstudio
+from gonio.scan import Run
+from tests import materials
+
+BLACK = Path(__file__).parents[1] / "data" / "optics-blacks" / "AnoBlackEC1onAlum.bsdf"
+
+
+def answer(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
+    code = main([str(a) for a in (*arguments, "--json")])
+    out = capsys.readouterr().out
+    assert code == 0, out
+    found: dict[str, object] = json.loads(out)
+    return found
+
+
+def test_info_says_what_the_file_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    found = answer(capsys, "info", BLACK)
+    assert found["format"] == "opticstudio" and found["samples"] == 647
+    assert found["incidences_deg"] == [10, 30, 50, 70] and found["with_uncertainty"] == 0
+    assert "f_r" in str(found["quantity_in_file"]) and "1/sr" in str(found["quantity_in_file"])
+    assert found["energy"] == "conserved" and len(found["albedo"]) == 3  # type: ignore[arg-type]
+    # specular pairs apart, the file has 10 swapped pairs, whose values differ by some per cent as measured ones do
+    assert found["reciprocal_pairs"] == 10 and 0.01 < float(found["reciprocity_rms"]) < 0.3  # type: ignore[arg-type]
+
+
+def test_info_of_a_file_that_makes_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    material = materials.Material((3.0 * materials.paint(0.9, 0.5),))
+    formats.export("csv", tmp_path / "a.csv", material=material)
+    assert "NOT conserved" in str(answer(capsys, "info", tmp_path / "a.csv")["energy"])
+
+
+def test_convert_of_opticstudio_keeps_every_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = answer(capsys, "convert", BLACK, tmp_path / "again.bsdf", "--format", "opticstudio")
+    assert found["content"] == "the same grid, number for number"
+    np.testing.assert_array_equal(opticstudio.read_table(tmp_path / "again.bsdf").value, opticstudio.read_table(BLACK).value)
+
+
+def test_convert_rows_as_they_are_and_one_channel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = materials.rgb().rows()
+    formats.export("astm", tmp_path / "a.astm", samples=rows)
+    answer(capsys, "convert", tmp_path / "a.astm", tmp_path / "b.csv", "--format", "csv")
+    np.testing.assert_array_equal(formats.read_channels(tmp_path / "b.csv").f_r, rows.f_r)
+    answer(capsys, "convert", tmp_path / "a.astm", tmp_path / "c.csv", "--format", "csv", "--channel", "blue")
+    np.testing.assert_array_equal(formats.read_samples(tmp_path / "c.csv").f_r, rows.f_r[:, 2])
+    assert main(["convert", str(tmp_path / "a.astm"), str(tmp_path / "d"), "--format", "csv", "--channel", "uv"]) == 2
+    assert "choose one of: red, green, blue" in capsys.readouterr().err
+
+
+def test_sparse_data_go_through_a_table_or_a_model_and_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = materials.single(0.4).rows()
+    one = rows.select(np.isclose(rows.theta_i, np.radians(30)))  # one incidence
+    formats.export("csv", tmp_path / "a.csv", samples=one)
+    code = main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "a.ssdd"), "--format", "ssdd"])
+    said = capsys.readouterr()
+    assert code == 0 and "1 incidence: all other directions come from a table that extrapolates" in said.err
+    assert "f_r = dL_r / dE_i [1/sr]" in said.out
+
+
+def test_a_grain_cannot_become_an_isotropic_table_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    formats.export("csv", tmp_path / "a.csv", samples=materials.brushed(0.1, 0.6).rows())
+    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "a.xml"), "--format", "klems"]) == 6
+    assert "depend on the incident azimuth" in capsys.readouterr().err
+    assert not (tmp_path / "a.xml").exists()
+
+
+def test_check_file_of_a_wrong_file_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("jsonschema")
+    formats.export("bird", tmp_path / "a.json", material=materials.single())
+    assert answer(capsys, "check-file", tmp_path / "a.json")["results"][1]["ok"] is True  # type: ignore[index]
+    (tmp_path / "b.json").write_text((tmp_path / "a.json").read_text().replace('"urn:uuid', '7, "x": "'))
+    assert main(["check-file", str(tmp_path / "b.json")]) == 6
+    assert "violations" in capsys.readouterr().err
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    with Run.create(tmp_path / "run", kind="import", documents={}, attributes={"source_file": "x"}) as made:
+        made.write_samples(materials.single().rows().channel())
+    return tmp_path / "run"
+
+
+def test_export_of_a_run_needs_a_table_or_a_fit(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(run), "--format", "rgl", "--out", str(tmp_path / "a.bsdf")]) == 6
+    assert "run `gonio table` or `gonio fit` first" in capsys.readouterr().err
+    assert main(["export", str(run), "--format", "png", "--out", str(tmp_path / "a")]) == 2
+    capsys.readouterr()
+    assert answer(capsys, "export", run, "--format", "bird", "--out", tmp_path / "a.json")["quantity"] == "brdf"
+    assert formats.sniff(tmp_path / "a.json") == "bird"
+
+
+def test_bundle_is_whole_and_its_sums_are_right(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "bundle"
+    arguments = ["bundle", str(run), "--out", str(out), "--title", 'Paint: "satin"', "--author", "Horn, Berthold", "--json"]
+    assert main(arguments) == 0
+    names = set(json.loads(capsys.readouterr().out)["files"])
+    wanted = {"data.nc", "samples.csv", "samples.bird.json", "report.html", "provenance.json", "LICENSE", "CITATION.cff"}
+    assert wanted | {"README.md", "SHA256SUMS"} <= names == {p.name for p in out.iterdir()}
+    for line in (out / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split("  ")
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+    citation = (out / "CITATION.cff").read_text()
+    assert 'title: "Paint: \\"satin\\""' in citation and 'family-names: "Horn"' in citation
+    assert main(arguments) == 6  # never over another folder
+    assert not [p for p in tmp_path.iterdir() if p.name.endswith(".part")]
