@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gonio.errors import ConfigurationError, DeviceError, GonioError
 from sim.camera import MessageParser, SimulatedCamera, encode_frame, encode_message
 from sim.clock import ScaledClock
-from sim.links import Link
+from sim.links import Link, received
 
 
 class CameraLink:
@@ -79,12 +79,9 @@ class _CameraConnection:
         return self._socket.fileno()
 
     def on_readable(self) -> Sequence[Link]:
-        try:
-            data = self._socket.recv(65_536)
-        except BlockingIOError:
+        data = received(self._socket)
+        if data is None:
             return ()
-        except OSError:
-            data = b""
         try:
             if not data:
                 raise ConnectionResetError

@@ -128,6 +128,16 @@ class Pump:
                 self._selector.unregister(key.fileobj)
 
 
+def received(client: socket.socket) -> bytes | None:
+    """What a client has sent; None if nothing is there, empty if it is gone."""
+    try:
+        return client.recv(65_536)
+    except BlockingIOError:
+        return None
+    except OSError:
+        return b""
+
+
 class _StreamLink:
     """A device behind a descriptor, with a queue of replies that are not due yet."""
 
@@ -286,12 +296,9 @@ class _Connection(_StreamLink):
         return self._socket.fileno()
 
     def on_readable(self) -> Sequence[Link]:
-        try:
-            data = self._socket.recv(65_536)
-        except BlockingIOError:
+        data = received(self._socket)
+        if data is None:
             return ()
-        except OSError:
-            data = b""
         if data:
             self._receive(data)
         else:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from gonio.errors import DeviceError
 from sim.camera import SimulatedCamera
 from sim.clock import ScaledClock
-from sim.links import Link
+from sim.links import Link, received
 
 _BOUNDARY = "frame"
 _HEAD = f"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary={_BOUNDARY}\r\n\r\n"
@@ -101,12 +101,9 @@ class _Viewer:
         return self._socket.fileno()
 
     def on_readable(self) -> Sequence[Link]:
-        try:
-            data = self._socket.recv(4096)
-        except BlockingIOError:
+        data = received(self._socket)
+        if data is None:
             return ()
-        except OSError:
-            data = b""
         self._request += data
         if not data or len(self._request) > _LONGEST_REQUEST:
             self.closed = True

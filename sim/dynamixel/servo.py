@@ -25,21 +25,26 @@ from sim.dynamixel.drive import Drive
 from sim.dynamixel.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD, Fault
 from sim.dynamixel.load import Load
 from sim.dynamixel.memory import Memory, Refused
+from sim.dynamixel.modes import (
+    CURRENT,
+    CURRENT_POSITION,
+    FULL_PWM,
+    GOAL_OF_MODE,
+    POSITION,
+    PWM,
+    TIME_BASED,
+    TORQUE_BY_GOAL,
+    VELOCITY,
+    check,
+    refresh,
+    sign,
+)
 from sim.dynamixel.motion import ACCELERATION_UNIT, COUNTS_PER_TURN, VELOCITY_UNIT
 from sim.dynamixel.packet import ErrorNumber
 
 __all__ = ["Refused", "Servo"]
 
-IN_POSITION_COUNTS = 16  # "smaller than a predefined value", the manual says; it does not say which
-FOLLOWING_ERROR_COUNTS = 64  # as little known
 WATCHDOG_UNIT_S = 0.020
-FULL_PWM = 885
-
-CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16  # operating modes
-_REVERSE, _TIME_BASED, _TORQUE_BY_GOAL = 1, 4, 8  # bits of Drive Mode
-_TIME_BASED_FIRMWARE = 42
-_GOAL_OF_MODE = {CURRENT: 102, VELOCITY: 104, POSITION: 116, EXTENDED: 116, CURRENT_POSITION: 116, PWM: 100}
-_SHAPE_BITS = {"step": 0, "rectangle": 1, "triangle": 2, "trapezoid": 3}
 _GAINS = ("Position D Gain", "Position I Gain", "Position P Gain", "Velocity I Gain", "Velocity P Gain")
 
 
@@ -198,7 +203,9 @@ class Servo:
             Access, if a byte is not defined; Data Length, if none is asked for.
         """
         self.advance(t)
-        self._refresh(t)
+        if not self.torque and not self._goal_pending:
+            self._memory["Goal Position"] = self._reading(self._drive.shaft.at(t)[0])
+        refresh(self._memory, self._drive, self.model, self._reading, t)
         return self._memory.read(address, length)
 
     def write(self, address: int, data: bytes, t: float, *, eeprom: bool = True) -> None:
@@ -304,39 +311,8 @@ class Servo:
     def _checked(self, address: int, data: bytes, eeprom: bool) -> list[tuple[Register, int]]:
         items = self._memory.items(address, data, eeprom=eeprom and not self.torque)
         for register, value in items:
-            self._check(register, value)
+            check(self._memory, self.model, self.firmware, register, value)
         return items
-
-    def _check(self, register: Register, value: int) -> None:
-        """Refuse a value that the register may not have, as things are."""
-        memory, address = self._memory, register.address
-        one_turn = address == 116 and memory["Operating Mode"] == POSITION
-        if not register.lower <= value <= register.upper:
-            # What lies outside the limits that the user set, and inside those of the table, is a Data Limit error.
-            raise Refused(ErrorNumber.DATA_LIMIT if one_turn else ErrorNumber.DATA_RANGE)
-        if address in _GOAL_OF_MODE.values() and memory["Bus Watchdog"] < 0:
-            raise Refused(ErrorNumber.DATA_RANGE)
-        if address == 11 and value not in self.model.operating_modes:
-            raise Refused(ErrorNumber.DATA_RANGE)
-        if address == 10 and value & ~self._drive_mode_bits:
-            raise Refused(ErrorNumber.DATA_RANGE)
-        if address == 64 and value == 1 and memory["Hardware Error Status"] & memory["Shutdown"]:
-            raise Refused(ErrorNumber.RESULT_FAIL)  # shut down; only a reboot restores torque
-        lower, upper = register.lower, register.upper
-        if one_turn:
-            lower, upper = memory["Min Position Limit"], memory["Max Position Limit"]
-        elif address in (100, 102, 104):
-            upper = memory[{100: "PWM Limit", 102: "Current Limit", 104: "Velocity Limit"}[address]]
-            lower = -upper
-        if not lower <= value <= upper:
-            raise Refused(ErrorNumber.DATA_LIMIT)
-
-    @property
-    def _drive_mode_bits(self) -> int:
-        bits = _REVERSE
-        if self.firmware >= _TIME_BASED_FIRMWARE:
-            bits |= _TIME_BASED
-        return bits | (_TORQUE_BY_GOAL if self.reads_fast else 0)
 
     def _apply(self, register: Register, value: int, t: float) -> None:
         before = self._memory[register.name]
@@ -344,7 +320,7 @@ class Servo:
         if register.address == 116:
             self._goal_written(t)
         elif register.address in (100, 102, 104) and self.torque:
-            if register.address == _GOAL_OF_MODE[self._memory["Operating Mode"]]:
+            if register.address == GOAL_OF_MODE[self._memory["Operating Mode"]]:
                 self._go(t)
         elif register.address == 64 and value != before:
             if value:
@@ -365,50 +341,9 @@ class Servo:
             if "Goal Current" in self._memory:
                 self._memory["Goal Current"] = self._memory["Current Limit"] if value != CURRENT else 0
 
-    def _refresh(self, t: float) -> None:
-        """Bring the registers that change by themselves up to date."""
-        memory, drive = self._memory, self._drive
-        position, velocity = drive.shaft.at(t)
-        present = self._reading(position)
-        mode = memory["Operating Mode"]
-        if not self.torque and not self._goal_pending:
-            memory["Goal Position"] = present
-        goal = memory["Goal Position"]
-        wanted, wanted_velocity = drive.trajectory.at(t)
-        ongoing, following, status = False, present, 0
-        if mode in (POSITION, EXTENDED, CURRENT_POSITION):
-            ongoing = not drive.trajectory.done(t)
-            following = self._reading(wanted)
-            status = int(self.torque and not ongoing and abs(goal - present) <= IN_POSITION_COUNTS)
-            status |= int(ongoing) << 1
-            status |= int(self.torque and abs(following - present) > FOLLOWING_ERROR_COUNTS) << 3
-        if mode not in (CURRENT, PWM):
-            status |= _SHAPE_BITS[drive.trajectory.shape] << 4
-        else:
-            wanted_velocity = 0.0
-        speed = self._sign * round(velocity / VELOCITY_UNIT)
-        memory["Realtime Tick"] = int(t * 1000.0) & 0x7FFF
-        memory["Moving"] = int(ongoing or abs(speed) > memory["Moving Threshold"])
-        memory["Moving Status"] = status
-        torque, current, effort, voltage = drive.feel(t)
-        memory["Present PWM"] = self._sign * round(FULL_PWM * effort)
-        unit = self.model.motor.current_unit_a
-        if unit is None:
-            memory["Present Load"] = self._sign * round(1000.0 * torque / self.model.motor.stall_torque_nm)
-        else:
-            memory["Present Current"] = self._sign * round(current / unit)
-        memory["Present Velocity"] = speed
-        memory["Present Position"] = present
-        memory["Velocity Trajectory"] = self._sign * round(wanted_velocity / VELOCITY_UNIT)
-        memory["Position Trajectory"] = following
-        memory["Present Input Voltage"] = round(10.0 * voltage)
-        memory["Present Temperature"] = min(round(drive.heat.at(t)), 255)
-        memory["Backup Ready"] = int(memory.backed_up)
-
     @property
     def _sign(self) -> int:
-        """-1 in reverse mode."""
-        return -1 if self._memory["Drive Mode"] & _REVERSE else 1
+        return sign(self._memory)
 
     @property
     def _offset(self) -> int:
@@ -446,7 +381,7 @@ class Servo:
         mode = self._memory["Operating Mode"]
         if mode == POSITION:
             self._fold_position(t)
-        if not self._goal_pending and _GOAL_OF_MODE[mode] == 116:
+        if not self._goal_pending and GOAL_OF_MODE[mode] == 116:
             here = self._drive.shaft.at(t)[0]
             self._memory["Goal Position"] = self._reading(here)
             self._drive.hold(t)
@@ -456,12 +391,12 @@ class Servo:
 
     def _goal_written(self, t: float) -> None:
         self._goal_writes += 1
-        by_goal = self._memory["Drive Mode"] & _TORQUE_BY_GOAL
+        by_goal = self._memory["Drive Mode"] & TORQUE_BY_GOAL
         if by_goal and not self._memory["Hardware Error Status"] & self._memory["Shutdown"]:
             self._memory["Torque Enable"] = 1
         if not self.torque:
             self._goal_pending = True
-        elif _GOAL_OF_MODE[self._memory["Operating Mode"]] == 116:
+        elif GOAL_OF_MODE[self._memory["Operating Mode"]] == 116:
             self._go(t)
         for fault, due in list(self._faults):
             if due is None and fault.at_goal_write == self._goal_writes:
@@ -490,7 +425,7 @@ class Servo:
         else:
             goal = self._sign * (memory["Goal Position"] - self._offset + self._fold)
             velocity = memory["Profile Velocity"] * VELOCITY_UNIT or math.inf
-            if memory["Drive Mode"] & _TIME_BASED:
+            if memory["Drive Mode"] & TIME_BASED:
                 distance = goal - drive.trajectory.at(t)[0]
                 velocity, acceleration = motion.limits_of_times(
                     distance, 1e-3 * memory["Profile Velocity"], 1e-3 * memory["Profile Acceleration"]

@@ -15,6 +15,7 @@ from gonio.errors import ConfigurationError, ParameterError
 from sim.dynamixel import Servo
 from sim.lamp import ScpiLamp
 from sim.settings import AXES, Settings
+from sim.simulation import Simulation
 from sim.world import Truth, World
 
 COUNT = 2 * math.pi / 4096
@@ -219,3 +220,69 @@ def test_two_independent_kinematics_agree(arm, pan, tilt):
     f_r = world.truth.sample_brdf().f_r(theta_i, phi_i, theta_r, phi_r)
     expected = max(float(f_r * np.cos(theta_i)), 0.0) / 0.5**2
     assert world.radiance(0.0, EYE, DOWN)[0] == pytest.approx(expected, rel=1e-8, abs=1e-10)
+
+
+# ---- what else a bench may have ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", ["lambertian", "oren_nayar"])
+def test_a_white_has_its_radiance_factor_at_the_certificates_geometry(model):
+    """Expected: pi L / E = white_beta there, whatever the white's BRDF; elsewhere another one unless it is Lambertian."""
+    parameters = {"albedo": 0.9, "sigma": 0.4} if model == "oren_nayar" else {}
+    seen = {}
+    for pose in ((30.0, 15.0, 0.0), (40.0, -20.0, 0.0)):
+        world = bench(pose, white_beta=0.97, white_model=model, white_parameters=parameters)
+        world.mount("white")
+        cosine = math.cos(math.radians(pose[0] - pose[1]))
+        seen[pose] = world.radiance(0.0, EYE, DOWN)[0] * math.pi * 0.5**2 / cosine
+    assert seen[30.0, 15.0, 0.0] == pytest.approx(0.97, rel=1e-9)
+    assert (abs(seen[40.0, -20.0, 0.0] - 0.97) < 1e-9) == (model == "lambertian")
+
+
+def test_hidden_mechanics_reach_the_servos():
+    """Expected: a tilt axis that carries 1 N m at 90 degrees from hanging droops by 34.5 counts; waves move the arm."""
+    config = {
+        "load_nm": {"tilt": 1.0}, "hanging_deg": {"tilt": 90.0}, "encoder_harmonics_deg": {"arm": [[1, 0.5, 90.0]]},
+        "friction_counts": [0, 0], "errors": False, "backlash_deg": 0.0, "supply_v": 11.0,
+    }  # fmt: skip
+    simulation = Simulation({"sim": {"truth": config}})
+    tilt = simulation.servos["tilt"]
+    tilt.write(64, b"\x01", 0.0)
+    tilt.write(116, (2048).to_bytes(4, "little"), 0.0)
+    assert tilt.shaft_counts(9.0) - 2048 == pytest.approx(4096 / 4096 / (4.1 * 800 / 128 / 885), rel=0.01)
+    wave = 0.5 * math.sin(math.pi + math.pi / 2)
+    assert math.degrees(simulation.world.angles(9.0)["arm"]) == pytest.approx(wave, abs=1e-9)
+    assert simulation.servos["arm"].read(144, 2, 0.0) == (110).to_bytes(2, "little")
+    told = simulation.camera.truth()
+    assert told["encoder_harmonics_deg"]["arm"] == [[1, pytest.approx(0.5), pytest.approx(90.0)]]
+    assert (told["load_nm"]["tilt"], told["supply_v"], told["sensor"]["response"]) == (1.0, 11.0, "linear")
+
+
+def test_led_channels_colour_the_light():
+    channels = [{"share": 0.75, "colour": [3, 0, 0]}, {"share": 0.25, "colour": [0, 0, 3]}]
+    truth = {"lamp_channels": channels, "cfa": "RGGB", "errors": False, "lamp_drift_per_hour": 0.0}
+    simulation = Simulation({"sim": {"truth": truth}})
+    simulation.lamp.feed(b"OUTP1 ON;:OUTP2 ON\n", 0.0)
+    both = simulation.camera.rate(0.0)[60:62, 80:82]
+    simulation.lamp.feed(b"OUTP1 OFF\n", 1.0)
+    blue = simulation.camera.rate(1.0)[60:62, 80:82]
+    assert both[0, 0] / both[1, 1] == pytest.approx(0.75 * 0.6 / (0.25 * 0.5), rel=1e-3)
+    assert both[0, 1] == both[1, 0] == blue[0, 0] == 0.0
+    assert blue[1, 1] == pytest.approx(both[1, 1])
+
+
+@pytest.mark.parametrize(
+    ("truth", "message"),
+    [
+        ({"shape": "cube"}, "choose one of flat, sphere, cylinder"),
+        ({"lamp_channels": []}, "must be a list of tables"),
+        ({"lamp_channels": [{"shade": 1}]}, "did you mean 'share'"),
+        ({"encoder_harmonics_deg": {"arm": [[1, 0.5]]}}, "3 numbers"),
+        ({"load_nm": {"elbow": 1.0}}, "known are arm, pan, tilt"),
+        ({"lamp_radius_mm": 400.0}, "outside 0 to 150"),
+        ({"board_squares": [2, 2]}, "outside 3 to 50"),
+    ],
+)
+def test_a_bench_that_cannot_be_is_refused(truth, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Truth.draw(Settings.from_mapping({"sim": {"truth": truth}}))
