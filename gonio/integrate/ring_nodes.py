@@ -294,7 +294,7 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, be
         b = min(stop, ahead)
         if behind >= _FIRST * edge:
             b = min(b, reach - behind)
-        if stop - b < 0.4 * (b - a):
+        if stop - b < 0.4 * (b - a) and behind < _FIRST * edge:
             b = stop
         to_lobe, to_edge = math.sqrt(b * b + pole * pole), math.sqrt((reach - b) ** 2 + edge * edge)
         stretch = min(from_lobe + to_lobe, from_edge + to_edge, math.sqrt((b - a) ** 2 + 4.0 * opposite**2)) / (b - a)
