@@ -7,7 +7,8 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.dynamixel import DynamixelBus, Servo
+from sim.dynamixel import DynamixelBus, Fault, Servo
+from sim.dynamixel.load import Load
 from sim.dynamixel.packet import Damaged, Instruction, Packet, Parser, encode
 from sim.lamp import ScpiLamp
 
@@ -83,3 +84,32 @@ def test_a_lamp_survives_any_bytes(data: bytes) -> None:
     lamp.feed(b"\n*CLS\n", 0.0)
     assert lamp.feed(b"*OPC?\n", 1.0) == [(0.0, b"1\n")]
     assert 0.0 <= lamp.relative_output(2.0) <= 1.0
+
+
+ORDERS = st.lists(
+    st.tuples(
+        st.sampled_from([(10, 1), (11, 1), (20, 4), (31, 1), (36, 2), (38, 2), (64, 1), (82, 2), (84, 2), (98, 1), (100, 2),
+                         (102, 2), (104, 4), (108, 4), (112, 4), (116, 4)]),
+        st.one_of(st.sampled_from([0, 1, 2, 3, 4, 5, 8, 16, 50]), st.integers(-5000, 5000)),
+        st.floats(0.0, 20.0),
+    ),
+    max_size=30,
+)  # fmt: skip
+
+
+@settings(derandomize=True, max_examples=150, deadline=None)
+@given(ORDERS, st.floats(0.0, 5.0), st.sampled_from(["obstacle", "stuck", "reboot", "hardware"]), st.floats(0.0, 60.0))
+def test_a_loaded_servo_survives_any_orders(orders, torque: float, kind, at: float) -> None:  # type: ignore[no-untyped-def]
+    """Weight, an accident, and whatever is written when: its readings stay numbers, and asking twice changes nothing."""
+    servo = Servo(1, load=Load(torque, 100.0), backlash_counts=3.0)
+    bus = DynamixelBus([servo], [Fault(kind, at_time_s=at)])
+    t = 0.0
+    for (address, size), value, later in orders:
+        t += later
+        data = (value & (1 << 8 * size) - 1).to_bytes(size, "little")
+        assert len(bus.feed(encode(1, Instruction.WRITE, address.to_bytes(2, "little") + data), t)) == 1
+    t += 1.0
+    first = bus.feed(encode(1, Instruction.READ, b"\x7a\0\x19\0"), t)
+    assert bus.feed(encode(1, Instruction.READ, b"\x7a\0\x19\0"), t) == first
+    assert servo.output_counts(t) == servo.output_counts(t)
+    assert abs(servo.output_counts(t) - servo.shaft_counts(t)) <= 1.5 + 1e-6
