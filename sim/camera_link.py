@@ -106,7 +106,7 @@ class _CameraConnection:
         self._flush()
         if self._then is not None and time.monotonic() >= self._then_due:
             step, self._then = self._then, None
-            step()
+            self._try(step)
             self._serve()
 
     def close(self) -> None:
@@ -124,15 +124,19 @@ class _CameraConnection:
         """Take the next request when none is running."""
         while self._requests and self._then is None and not self._lost:
             request = self._requests.popleft()
-            try:
-                self._execute(request)
-            except ConfigurationError as error:
-                self._send(encode_message({"ok": False, "kind": "configuration", "error": str(error)}))
-            except GonioError as error:
-                if self._camera.unplugged:
-                    self._lose()
-                else:
-                    self._send(encode_message({"ok": False, "kind": "device", "error": str(error)}))
+            self._try(lambda request=request: self._execute(request))  # type: ignore[misc]
+
+    def _try(self, step: Callable[[], None]) -> None:
+        """Do it, or tell the client why not."""
+        try:
+            step()
+        except ConfigurationError as error:
+            self._send(encode_message({"ok": False, "kind": "configuration", "error": str(error)}))
+        except GonioError as error:
+            if self._camera.unplugged:
+                self._lose()
+            else:
+                self._send(encode_message({"ok": False, "kind": "device", "error": str(error)}))
 
     def _execute(self, request: Mapping[str, Any]) -> None:
         what = request.get("do")

@@ -10,7 +10,7 @@ import socket
 import time
 from collections.abc import Sequence
 
-from gonio.errors import DeviceError
+from gonio.errors import DeviceError, GonioError
 from sim.camera import SimulatedCamera
 from sim.clock import ScaledClock
 from sim.links import Link, received
@@ -120,7 +120,10 @@ class _Viewer:
         self._next = max((self._next or 0.0) + interval, time.monotonic())
         self._flush()
         if not len(self._unsent) and not self.closed:  # else this frame is dropped
-            self._unsent = memoryview(self._link.picture())
+            try:
+                self._unsent = memoryview(self._link.picture())
+            except GonioError:  # there is no picture of this bench; the camera's own socket tells why
+                self.closed = True
             self._flush()
 
     def close(self) -> None:

@@ -134,6 +134,19 @@ def test_the_camera_refuses_and_goes_on(rig):
     camera.close()
 
 
+def test_a_picture_that_cannot_be_computed_is_refused_in_one_sentence(tmp_path):
+    """Rationale: the refusal comes in the middle of an exposure; the simulator must not end with it."""
+    config = write_config(tmp_path, **{"lens_radius_mm": 90.0, "ggx.alpha": 0.001})
+    with served("--config", config) as (process, ready):
+        assert lamp_says(ready["lamp"], b"OUTP ON;OUTP?\n") == b"1\n"
+        camera = SocketCamera(ready["camera"])
+        for _ in range(2):
+            with pytest.raises(ConfigurationError, match="too large for so narrow a lobe"):
+                camera.capture(0.001, label="x")
+        camera.close()
+        assert process.poll() is None
+
+
 def test_clients_may_come_and_go(rig):
     """Rationale: a descriptor that is free again must not confuse the loop."""
     for k in range(20):
