@@ -48,7 +48,8 @@ def lost(facets: Facets, at: int) -> Any:
     def loss(mu, s2, p):  # type: ignore[no-untyped-def]
         # pieces of ln((mu + near) / (s + tip))
         x = log((mu * p[at + 1] + 1.0) * (1.0 + tip) / (math.sqrt(s2) + tip)) * p[at + 2]
-        return read_pieces(x, p, at + 3, count)
+        value = read_pieces(x, p, at + 3, count)
+        return value if value > 0.0 else 0.0  # smooth surfaces lose less than the table's rounding
 
     return jit.model(loss)
 

@@ -98,8 +98,8 @@ def lafortune_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: flo
     d2, z2 = x * x + y * y, z * z
     # 1 - (sign * (x x + y y) + z z), 1 - sign * (x x + y y) and 1 - z z of the two unit vectors
     less = 0.5 * (d2 + z2)
-    less_xy = 0.5 * (d2 + zi * zi + zr * zr)
-    less_z = 0.5 * (z2 + (xi * xi + yi * yi) + (xr * xr + yr * yr))
+    less_xy = 0.5 * (d2 + (zi * zi + zr * zr))
+    less_z = 0.5 * (z2 + ((xi * xi + yi * yi) + (xr * xr + yr * yr)))
     less = both * less + (r_xy - both) * less_xy + (r_z - both) * less_z
     along = 1.0 - less if less < 0.5 else (c_xy * two_products(xi, xr, yi, yr) + c_z * (zi * zr)) / largest
     lit = (zi > 0.0) & (zr > 0.0) & (along > 0.0) & (r_xy + r_z > 0.0)
