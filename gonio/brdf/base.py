@@ -108,6 +108,9 @@ class Model:
         ``(p, omega_r (..., 3)) -> (..., k, 4)``: planes ``c . w = d`` (rows c_x, c_y, c_z, d; c a unit vector) across which
         f_r or a derivative jumps, as a function of w = omega_i for the given omega_r; the integrator breaks its panels
         there. A plane that one omega_r does not have is out of reach: d = 2. A user's own function takes one omega_r.
+    kink_power : callable, optional
+        Of the parameter array: f_r begins at its kinks as this broken power of the distance; infinite for one so high that
+        it is smooth. None: on either side of its kinks f_r is smooth.
     bent : bool
         A derivative jumps elsewhere too, not at planes: only cells that are halved until they agree will do.
     features : callable, optional
@@ -139,6 +142,7 @@ class Model:
     lobe_width: Callable[[Array], float] | None = None
     layer_width: Callable[[Array], float] | None = None
     kinks: Callable[[Array, Array], Array] | None = None
+    kink_power: Callable[[Array], float] | None = None
     bent: bool = False
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None

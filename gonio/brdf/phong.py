@@ -41,6 +41,7 @@ from gonio.brdf.elementary import exp, log_near, two_products
 Array = NDArray[np.float64]
 INV_TWO_PI = 0.5 / math.pi
 _SMOOTH = 40.0  # from that exponent on, what lies next to the cut is nothing, even where only the tail is lit
+_BROKEN = 8.0  # and a broken power is as good as a polynomial
 
 
 def power_width(n: float) -> float:
@@ -72,6 +73,15 @@ def _kinks(p: Array, omega_r: Array) -> Array:
     return plane[..., None, :]
 
 
+def cut_power(n: float) -> float:
+    """The power with which a lobe begins at its cut, unless it is whole or so high that it is smooth."""
+    return n if n < _BROKEN and n != math.floor(n) else math.inf
+
+
+def _kink_power(p: Array) -> float:
+    return cut_power(float(p[1]))
+
+
 _N = Parameter("n", 0.0, 1e8, "exponent", ("log_normal", math.log(50.0), 2.0))
 
 PHONG = Model(
@@ -82,6 +92,7 @@ PHONG = Model(
     reference="Phong, CACM 18(6), 1975; Lafortune & Willems, Report CW 197, K.U. Leuven, 1994",
     lobe_width=_width,
     kinks=_kinks,
+    kink_power=_kink_power,
 )
 
 
@@ -131,6 +142,10 @@ def _lafortune_kinks(p: Array, omega_r: Array) -> Array:
     return np.concatenate((axis, out_of_reach[..., None]), axis=-1)[..., None, :]
 
 
+def _lafortune_kink_power(p: Array) -> float:
+    return cut_power(float(p[3]))
+
+
 def _lafortune_features(p: Array, omega_r: Array) -> Array:
     if _mirrors(p) or p[3] <= 1.0:
         return np.empty((0, 4))
@@ -150,5 +165,6 @@ LAFORTUNE = Model(
     reference="Lafortune, Foo, Torrance & Greenberg, SIGGRAPH 1997",
     lobe_width=_lafortune_width,
     kinks=_lafortune_kinks,
+    kink_power=_lafortune_kink_power,
     features=_lafortune_features,
 )

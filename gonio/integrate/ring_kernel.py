@@ -61,18 +61,18 @@ def ring_kernel(function: Callable[..., float]) -> Any:
     """Compiled kernel of one model's function.
 
     Its arguments: ``slopes`` (k, 2), cos and sin of theta_n; the term's parameters, weight and lobe ``width``; ``layers``
-    (k,); ``peaks`` (k, i, 3) in the plane of incidence: theta, cos D and half width; ``planes`` (k, j, 4);
-    ``edges`` and ``detail``, `Spectrum.groups` or the rows of a map; ``breaks`` and ``series``
-    of the `Spectrum`; what it needs (`Needed`) and the ``error`` (panels,) of the series; whether ``rows`` are kinks;
-    natural ``digits``; `gauss_table`; ``out`` (k, 3, waves >= 3), which receives A_m, B_m and, in its last row, the
-    directional albedo, the error of R due to that of the series, and that due to waves that are cut off; ``effort`` (1,),
-    evaluations.
+    (k,); ``peaks`` (k, i, 3) in the plane of incidence: theta, cos D and half width; ``planes`` (k, j, 4) of kinks, and the
+    ``corner`` of broken powers at them [rad] or 0; ``edges`` and ``detail``, `Spectrum.groups` or the rows of a map;
+    ``breaks`` and ``series`` of the `Spectrum`; what it needs (`Needed`) and the ``error`` (panels,) of the series; whether
+    ``rows`` are kinks; natural ``digits``; `gauss_table`; ``out`` (k, 3, waves >= 3), which receives A_m, B_m and, in its
+    last row, the directional albedo, the error of R due to that of the series, and that due to waves that are cut off;
+    ``effort`` (1,), evaluations.
     """
 
-    def ring_sums(slopes, p, weight, width, layers, peaks, planes, edges, detail, breaks, series, used, bent, rest, cut, error, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
+    def ring_sums(slopes, p, weight, width, layers, peaks, planes, corner, edges, detail, breaks, series, used, bent, rest, cut, error, rows, digits, x_table, w_table, out, effort):  # type: ignore[no-untyped-def]  # noqa: E501
         most = out.shape[2]
         points, cuts = np.empty(CAPACITY + 2 * breaks.size), np.empty(planes.shape[1])
-        touch = np.empty((2 + 2 * planes.shape[1], 2))
+        touch = np.empty((2 + 2 * planes.shape[1] + planes.shape[1] * (planes.shape[1] + 1) // 2, 2))
         room = (RING + 2 * most) // LANES * LANES
         nodes, weights = np.empty(room), np.empty(room)
         cosine, kernel = np.empty(room), np.empty(room)
@@ -85,9 +85,9 @@ def ring_kernel(function: Callable[..., float]) -> Any:
             layer = layers[slope]
             total = out[slope]
             total[:] = 0.0
-            touching = tangents(touch, sn, cn, theta_n, planes[slope])
+            touching = tangents(touch, sn, cn, theta_n, planes[slope], corner)
             panels = theta_panels(
-                points, touch, touching, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], edges, rows
+                points, touch, touching, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], corner, edges, rows
             )
             held = 0  # the panel of the source whose moments are being summed
             for panel in range(panels - 1):
@@ -123,8 +123,8 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                     k = _panel_of(breaks, t)
                     waves = min(used[k], most)
                     n = ring_nodes(
-                        cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], 0.25 * (waves - 1),
-                        rest[0, k], digits, 2.0 * st * dt * weight, x_table, w_table, nodes, weights,
+                        cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks[slope], planes[slope], corner,
+                        0.25 * (waves - 1), rest[0, k], digits, 2.0 * st * dt * weight, x_table, w_table, nodes, weights,
                     )  # fmt: skip
                     effort[0] += n
                     for j in range(n):

@@ -100,10 +100,11 @@ def _order(stretch, digits):  # type: ignore[no-untyped-def]
 
 
 @jit.part
-def tangents(touch, sn, cn, theta_n, planes):  # type: ignore[no-untyped-def]
+def tangents(touch, sn, cn, theta_n, planes, corner):  # type: ignore[no-untyped-def]
     """Rings that the horizon or a plane of kinks touches, rows of theta and the side (-1, 1) on which they are crossed.
 
-    There integrals over rings have square roots. Returns how many; the first two are those of the horizon.
+    There integrals over rings have square roots. Broken powers have structure on both sides, side 0, and where planes meet.
+    Returns how many; the first two are those of the horizon.
     """
     touch[0, 0], touch[0, 1] = 0.5 * math.pi - theta_n, 1.0
     touch[1, 0], touch[1, 1] = min(math.pi, 0.5 * math.pi + theta_n), -1.0
@@ -112,14 +113,33 @@ def tangents(touch, sn, cn, theta_n, planes):  # type: ignore[no-untyped-def]
         if abs(planes[k, 3]) < 1.0:
             gamma = abs(math.atan2(planes[k, 0] * cn + planes[k, 2] * sn, planes[k, 2] * cn - planes[k, 0] * sn))
             opening = math.acos(planes[k, 3])
-            touch[n, 0], touch[n, 1] = abs(gamma - opening), 1.0
-            touch[n + 1, 0], touch[n + 1, 1] = min(gamma + opening, 2.0 * math.pi - gamma - opening), -1.0
+            side = 1.0 if corner == 0.0 else 0.0
+            touch[n, 0], touch[n, 1] = abs(gamma - opening), side
+            touch[n + 1, 0], touch[n + 1, 1] = min(gamma + opening, 2.0 * math.pi - gamma - opening), -side
             n += 2
+    for k in range(planes.shape[0] if corner > 0.0 else 0):
+        for j in range(-1, k):
+            t = _meeting(planes, k, j, sn, cn)
+            if t > 0.0:
+                touch[n, 0], touch[n, 1] = t, 0.0
+                n += 1
     return n
 
 
 @jit.part
-def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, peaks, planes, edges, rows):  # type: ignore[no-untyped-def]
+def _meeting(planes, k, j, sn, cn):  # type: ignore[no-untyped-def]
+    """The ring on which two planes of kinks meet, or (j = -1) one and the horizon [rad]; -1 if they do not."""
+    c_x, c_z, d = (0.0, 1.0, 0.0) if j < 0 else (planes[j, 0], planes[j, 2], planes[j, 3])
+    determinant = planes[k, 0] * c_z - planes[k, 2] * c_x
+    if abs(determinant) <= 1e-12:
+        return -1.0
+    x = (planes[k, 3] * c_z - planes[k, 2] * d) / determinant
+    z = (planes[k, 0] * d - planes[k, 3] * c_x) / determinant
+    return math.acos(min(1.0, max(-1.0, z * cn - x * sn))) if x * x + z * z < 1.0 else -1.0
+
+
+@jit.part
+def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, peaks, planes, corner, edges, rows):  # type: ignore[no-untyped-def]
     """Edges of the panels in theta; returns how many. ``edges``: rows of a map, or where another field changes detail."""
     upper = touch[1, 0]
     n = 0
@@ -127,13 +147,7 @@ def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, peaks, 
         n = _insert(points, n, touch[k, 0], 0.0, upper)
     for k in range(planes.shape[0]):  # rings where two kinks, or a kink and the horizon, meet
         for j in range(-1, k):
-            c_x, c_z, d = (0.0, 1.0, 0.0) if j < 0 else (planes[j, 0], planes[j, 2], planes[j, 3])
-            determinant = planes[k, 0] * c_z - planes[k, 2] * c_x
-            if abs(determinant) > 1e-12:
-                x = (planes[k, 3] * c_z - planes[k, 2] * d) / determinant
-                z = (planes[k, 0] * d - planes[k, 3] * c_x) / determinant
-                if x * x + z * z < 1.0:
-                    n = _insert(points, n, math.acos(min(1.0, max(-1.0, z * cn - x * sn))), 0.0, upper)
+            n = _insert(points, n, _meeting(planes, k, j, sn, cn), 0.0, upper)
     for k in range(1, edges.size - 1):  # kinks of a map; else only for economy
         apart = 0.0 if rows else 0.3 * min(edges[k + 1] - edges[k], edges[k] - edges[k - 1])
         n = _insert_apart(points, n, edges[k], apart, upper)
@@ -144,12 +158,16 @@ def theta_panels(points, touch, touching, sn, cn, theta_n, width, layer, peaks, 
     if layer < 10.0:
         n = _grow(points, n, upper, layer, 0.0, upper)
         n = _grow(points, n, touch[0, 0], layer, 0.0, upper)
+    for k in range(2, touching if corner > 0.0 else 2):
+        n = _grow(points, n, touch[k, 0], corner, 0.0, upper)
     for k in range(n, 0, -1):
         points[k] = points[k - 1]
     points[0], points[n + 1] = 0.0, upper
     n += 2
     for k in range(touching):  # a square root just outside a long panel: grade that panel towards it
         side = touch[k, 1]
+        if side == 0.0:
+            continue
         i = np.searchsorted(points[:n], touch[k, 0] + side * 1e-12)
         i = i - 1 if side < 0.0 else i
         if i < 0 or i >= n:
@@ -231,11 +249,11 @@ def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, bend, rest,
     """
     starts, ends, square_roots = False, False, 1e9
     for k in range(touching):
-        if touch[k, 1] > 0.0 and abs(a - touch[k, 0]) < 1e-12:
+        if touch[k, 1] >= 0.0 and abs(a - touch[k, 0]) < 1e-12:
             starts = True
-        elif touch[k, 1] < 0.0 and abs(b - touch[k, 0]) < 1e-12:
+        elif touch[k, 1] <= 0.0 and abs(b - touch[k, 0]) < 1e-12:
             ends = True
-        elif (touch[k, 1] > 0.0) == (touch[k, 0] < a):
+        elif touch[k, 1] == 0.0 or (touch[k, 1] > 0.0) == (touch[k, 0] < a):
             square_roots = min(square_roots, _stretch(a, b, touch[k, 0], 0.0))
     stretch = 1e9
     if width < 10.0:
@@ -251,7 +269,7 @@ def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, bend, rest,
 
 
 @jit.part
-def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, bend, rest, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
+def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, corner, bend, rest, digits, scale, x_table, w_table, nodes, weights):  # type: ignore[no-untyped-def]  # noqa: E501
     """Nodes in D on the half ring from 0 to the horizon, weights times `scale`; how many, a multiple of `LANES`."""
     reach, clipped = _reach(st, ct, sn, cn)
     if reach == 0.0:
@@ -277,10 +295,19 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, be
             edge = layer / slope
     for k in range(planes.shape[0]):
         cuts[k] = _crossing(planes[k], st, ct, sn, cn)
+        if corner > 0.0 and clipped and cuts[k] > reach:
+            edge = min(edge, max(cuts[k] - reach, corner))
+        elif corner > 0.0 and (cuts[k] == 0.0 or cuts[k] == math.pi):  # where the ring comes nearest to it
+            c_z, c_x = planes[k, 2] * cn - planes[k, 0] * sn, planes[k, 0] * cn + planes[k, 2] * sn
+            apart = math.sqrt(2.0 * abs(abs(planes[k, 3] - c_z * ct) / max(abs(c_x * st), 1e-300) - 1.0))
+            if cuts[k] == 0.0:
+                pole = min(pole, max(apart, corner))
+            else:
+                edge = min(edge, max(apart, corner))
     ahead, behind = _FIRST * pole, _FIRST * edge  # next breakpoints: from the lobe on, and left to the horizon
     while behind * _GROWTH < reach:
         behind *= _GROWTH
-    count, a = 0, 0.0
+    count, a, passed = 0, 0.0, -1e9  # where the last kink was
     from_lobe, from_edge = pole, math.sqrt(reach * reach + edge * edge)
     while a < reach:
         stop = reach  # up to which nothing is bent
@@ -296,10 +323,22 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, be
             b = min(b, reach - behind)
         if stop - b < 0.4 * (b - a) and behind < _FIRST * edge:
             b = stop
+        stretch = 1e9
+        if corner > 0.0:  # panels grow from the kinks too
+            b = min(b, passed + max(_FIRST * corner, _GROWTH * (a - passed)))
+            if stop < reach and stop - a > _FIRST * corner:
+                b = min(b, stop - (stop - a) / _GROWTH)
+            if a > passed:
+                stretch = (a + b - 2.0 * passed) / (b - a)
+            if b < stop and stop < reach:
+                stretch = min(stretch, (2.0 * stop - a - b) / (b - a))
         to_lobe, to_edge = math.sqrt(b * b + pole * pole), math.sqrt((reach - b) ** 2 + edge * edge)
-        stretch = min(from_lobe + to_lobe, from_edge + to_edge, math.sqrt((b - a) ** 2 + 4.0 * opposite**2)) / (b - a)
+        stretch = min(stretch, (from_lobe + to_lobe) / (b - a), (from_edge + to_edge) / (b - a))
+        stretch = min(stretch, math.sqrt((b - a) ** 2 + 4.0 * opposite**2) / (b - a))
         order = bend * (b - a) + max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest * root(b - a)) + 0.5
         count = _arc(x_table, w_table, a, b, order, scale, nodes, weights, count)
+        if b == stop:
+            passed = b
         a, from_lobe, from_edge = b, to_lobe, to_edge
     last = nodes[count - 1]
     while count % LANES:

@@ -50,13 +50,14 @@ class Scene:
         x, w = gauss_table()
         kernel: Any = ring_kernel(self.term.model.function)
         needed = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1)
+        corner = self._corner(digits)
         edges, detail = (self.rings.breaks, np.zeros(1)) if self.rows else self.rings.groups
 
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
-                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile], edges,
-                detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
+                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile], corner,
+                edges, detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
                 digits * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
@@ -64,6 +65,11 @@ class Scene:
         tiles = [slice(k, k + 2) for k in range(0, len(tau), 2)]
         self.effort.add(sum(threads.run(work, tiles, self.threads)), math.ceil(digits))
         return out
+
+    def _corner(self, digits: float) -> float:
+        """Distance from a kink [rad] from which on a broken power must be resolved; 0 if there is none."""
+        power = math.inf if self.term.model.kink_power is None else self.term.model.kink_power(self.term.values)
+        return 0.0 if power == math.inf else float(max(1e-12, 10.0 ** (-(digits + 2.0) / (1.0 + power))))
 
     def _layers(self, cosine: Array) -> Array:
         """Width of the structure at the surface's horizon [rad]."""
@@ -93,7 +99,7 @@ class Scene:
 
 def first_digits(rtol: float) -> float:
     """Digits to begin with, of the largest value at a slope: smooth fields give three more than asked for."""
-    return min(MOST_DIGITS - 2.0, max(2.0, -2.0 - math.log10(rtol)))
+    return min(MOST_DIGITS - 2.0, max(3.0, -2.0 - math.log10(rtol)))
 
 
 def on_azimuths(sums: Array, columns: int, shift: float = 0.0) -> Array:

@@ -26,6 +26,7 @@ _DEEPEST = 24
 _TO_LIMB = 4.0  # by which a piece may come nearer to the limb than it began
 _WAVES_IN_PIECE = 8.0  # length of a piece times waves
 _NOISE = 0.1  # of the tolerance, for the quadrature
+_DOUBT = 0.03  # of the digits asked for, which sums may miss alike
 _SOME = [1, 2]  # probes of which the noise is measured
 _PATCHING = 0.05  # of the tolerance, for reading between the nodes
 
@@ -144,10 +145,11 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
         lost, tail = float(np.max(truncated(fine, waves))), float(np.max(tail_of(fine, scene.rings)))
         floor = max(floor_of(scene, sums) for sums in fine)
         cut = float(np.max(fine[:, 2, 2]))
-        error = _SAFETY * missed + floor + cut + tail
+        doubt = _DOUBT * 10.0**-digits * float(np.abs(exact).max())
+        error = _SAFETY * missed + doubt + floor + cut + tail
         smallest = min(float(np.abs(exact).min()), float(np.abs(on_azimuths(nodal, columns)).min()))
         allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), 5.0 * floor, resolution)
-        noise = max(noise, cut)
+        noise = max(noise, cut, 0.3 * doubt)
         noisy = noise > _NOISE * allowed and digits < MOST_DIGITS
         trials.append(
             _Trial(
@@ -217,7 +219,8 @@ def _survey(scene: Scene, lowest: float, highest: float, rtol: float, room: Room
         wanted = np.maximum(np.maximum(rtol * values.min(axis=1), spare[pending]), 1e-14 * values.max())
         noise = np.abs(on_azimuths(finer - sums[pending], 4 * most)).max(axis=1)
         sums[pending] = finer
-        again = np.maximum(noise, finer[:, 2, 2]) > _NOISE * wanted
+        doubt = 0.3 * _DOUBT * 10.0 ** (1.0 - level) * values.max(axis=1)
+        again = np.maximum(noise, np.maximum(finer[:, 2, 2], doubt)) > _NOISE * wanted
         pending = pending[again]
         if not pending.size or level >= MOST_DIGITS - 1.0:
             break

@@ -25,7 +25,8 @@ from gonio.integrate.spectrum import spectrum
 
 Array = NDArray[np.float64]
 _STEP = 1.5  # digits from one sum to the next
-_SHARE = 0.4  # of the difference of two sums that may be left in the finer one, which should be a thirtieth
+_STEADY, _SLOW = 2.0, 5.0  # of the difference of two sums, which should be thirty times what is left in the finer one
+_DOUBT = 0.1  # of the digits asked for: two sums may agree by chance
 FEW = 96  # distinct slopes up to which each is summed by itself
 
 
@@ -91,27 +92,30 @@ def _directly(
 ) -> tuple[Array, Array]:
     """Each slope by itself, with more digits and more waves until the tolerance is met."""
     value, error = np.zeros(len(phi)), np.full(len(phi), np.inf)
-    digits = max(2.0, first_digits(rtol) - 2.0)
+    digits = first_digits(rtol)
     waves = min(scene.rings.waves, scene.first_waves)
     pending = np.arange(len(slopes))
-    rough = scene.sums(slopes, digits, waves)
+    rough, before = scene.sums(slopes, digits, waves), np.full(len(slopes), np.inf)
     while True:
         fine = scene.sums(slopes[pending], digits + _STEP, waves)
         tail, columns = tail_of(fine, scene.rings), 4 * waves
+        largest = np.abs(on_azimuths(fine, columns)).max(axis=1)
         step = np.abs(on_azimuths(fine - rough, columns)).max(axis=1)
+        slow = (step > 0.2 * before) | (step > 10.0**-digits * largest)  # sums keep less than they promise
+        missed = np.where(slow, _SLOW, _STEADY) * step + _DOUBT * 10.0 ** -(digits + _STEP) * largest
         again = np.zeros(len(pending), dtype=np.bool_)
         for j, k in enumerate(pending):
             here = np.flatnonzero(where == k)
             value[here] = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
-            error[here] = _SHARE * step[j] + tail[j] + float(fine[j, 2, 2]) + floor_of(scene, fine[j])
+            error[here] = missed[j] + tail[j] + float(fine[j, 2, 2]) + floor_of(scene, fine[j])
             again[j] = np.any(error[here] > np.maximum(rtol * np.abs(value[here]), atol[here]))
         if not np.any(again):
             return value, error
-        pending, few_waves = pending[again], np.any(tail[again] > _SHARE * step[again]) and waves < scene.rings.waves
+        pending, few_waves = pending[again], np.any(tail[again] > 0.4 * missed[again]) and waves < scene.rings.waves
         if few_waves:
             waves = min(scene.rings.waves, 2 * waves)
-            rough = scene.sums(slopes[pending], digits, waves)
+            rough, before = scene.sums(slopes[pending], digits, waves), np.full(len(pending), np.inf)
         elif digits < MOST_DIGITS - _STEP:
-            digits, rough = digits + _STEP, fine[again]
+            digits, rough, before = digits + _STEP, fine[again], step[again]
         else:
             return value, error

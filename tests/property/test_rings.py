@@ -12,6 +12,7 @@ import gonio
 from gonio.geometry import gradient_from_normal, unit_vector
 from gonio.integrate import scene_radiance
 from gonio.integrate.plan import Method
+from tests.independent import reflected_radiance
 
 make_source, make_brdf = gonio.source.make, gonio.brdf.make
 Array = NDArray[np.float64]
@@ -121,3 +122,23 @@ def test_the_result_does_not_depend_on_threads() -> None:
         gonio.reflectance_map(brdf(0.1), SKY, AXIS[None, :], AXIS[:, None], rtol=1e-5, threads=n).value for n in (1, 2)
     )
     assert np.array_equal(one, two)
+
+
+@pytest.mark.parametrize("n", [0.5, 1.5, 1000.0])
+def test_broken_powers_and_sharp_lobes_against_independent_values(n: float) -> None:
+    """A lobe that begins at its cut as a broken power, where rules for polynomials agree with each other on what is wrong.
+
+    And one sharp enough that two low orders agree by chance.
+    """
+    term = {"model": "phong", "k_s": 0.5, "n": n}
+    part = {"kind": "spherical_harmonics", "coefficients": [3.0, 0.4, 0.9, -0.5, 0.3, -0.2, 0.35, 0.15, -0.25]}
+    p = np.concatenate(([0.3, -1.2, -0.35], np.linspace(-2.0, 2.0, 9)))  # as many as rings take
+    q = np.concatenate(([-0.5, 0.8, -0.1], np.linspace(0.1, 1.9, 9)))
+    scenes = [{"brdf": [term], "source": [part], "p": p[k], "q": q[k]} for k in range(3)]
+    truth = np.array([reflected_radiance(scene, "normal", 1e-11) for scene in scenes])
+    light = make_source("spherical_harmonics", coefficients=part["coefficients"])
+    for rtol in (1e-3, 1e-6, 1e-9):
+        got = gonio.reflectance_map(make_brdf("phong", k_s=0.5, n=n), light, p, q, rtol=rtol)
+        assert all(step.method is Method.RINGS for step in got.plan)
+        off = np.abs(got.value[:3] - truth) - 2e-11 * truth
+        assert np.all(off <= got.error[:3]) and np.all(off <= rtol * truth)
