@@ -56,8 +56,8 @@ class Scene:
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
-                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile], corner,
-                edges, detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
+                slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile],
+                corner, edges, detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
                 digits * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
