@@ -98,7 +98,7 @@ def regress(
         raise DatasetError(f"a table needs at least {FEWEST} samples, there are {len(f)}; fit a model instead")
     if not np.any(f > 0):
         raise DatasetError(f"none of the {len(f)} samples is positive; check the dark frames and the quantity")
-    u, known = _uncertainty(f, u)
+    u, known = working_uncertainty(f, u)
     chunks = -(-math.prod(shape) // 2048)
     total = chunks + 4
 
@@ -108,40 +108,24 @@ def regress(
 
     tell(0)
     some = np.random.default_rng(0).permutation(len(f))[:MANY]
-    settings, scale = _choose(_Data(x[some], f[some], u[some], known))
+    settings, scale = choose(Data(x[some], f[some], u[some], known))
     # nodes as dense as the lobe is narrow
     spread = float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
     position = grid_position(omega_i, omega_r, shape, spread)
-    data = _Data(x, f, u, known)
+    data = Data(x, f, u, known)
     if len(f) > MANY:
-        data = _Data(*_binned(x, f, u, position, shape), known)
-        settings, scale = _choose(data)
+        data = Data(*_binned(x, f, u, position, shape), known)
+        settings, scale = choose(data)
     tell(4)
     node_i, node_r, below = tabulated.node_directions(shape, spread)
     targets = coordinates(node_i.reshape(-1, 3), node_r.reshape(-1, 3))
-    found = []
-    for chunk in range(chunks):
-        found.append(data.fit(targets[chunk * 2048 : (chunk + 1) * 2048], settings))
-        tell(4 + chunk + 1)
-    local = Local(*(np.concatenate([getattr(part, n) for part in found]) for n in ("eta", "sigma", "outside", "nearest")))
-
-    # outside its neighbours, or far from all of them: a straight line only, and an error that grows with the distance
-    spacing = data.spacing(targets, settings)
     cell = tuple(np.rint(position).astype(np.int64).T)
     measured = np.zeros(shape, dtype=bool)
     measured[cell] = True
     # where azimuth has no meaning, one sample measures the node at all of them
     measured[0] |= measured[0].any(axis=-1, keepdims=True)
     measured[:, 0] |= measured[:, 0].any(axis=-1, keepdims=True)
-    far = ((local.outside > OUTSIDE) & (local.nearest > 0.7 * spacing)) | (local.nearest > 4.0 * spacing)
-    far &= ~measured.ravel()
-    eta, sigma = local.eta.copy(), scale * local.sigma * np.sqrt(1.0 + (local.nearest / spacing) ** 2 / 4.0)
-    sigma *= _excess(data, settings, scale, targets)
-    if np.any(far):
-        straight = data.fit(targets[far], replace(settings, order=1, neighbours=max(settings.neighbours, 12)))
-        eta[far] = straight.eta
-        beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing[far] / 4.0
-        sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, 0.2 + 0.3 * beyond)
+    eta, sigma, far = at_nodes(data, settings, scale, targets, measured.ravel(), lambda done: tell(4 + done))
     # standard deviation of a log-normal value over its median's: what is badly known may be far above
     sigma = np.minimum(sigma, 2.0)
     eta, relative_u = eta.reshape(shape), np.sqrt(np.expm1(sigma**2)).reshape(shape)
@@ -169,7 +153,38 @@ def regress(
     return tabulated.TabulatedBRDF(value, value * relative_u, coverage, attributes, spread)
 
 
-class _Data:
+def at_nodes(
+    data: Data,
+    settings: Settings,
+    scale: float,
+    targets: Array,
+    measured: NDArray[np.bool_],
+    tell: Callable[[int], None],
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """ln f, its standard error and whether it is extrapolated, at the targets (m, k).
+
+    Outside its neighbours, or far from all of them, a node gets a straight line only, and an error that grows with the
+    distance; not where a sample measured it.
+    """
+    found = []
+    for chunk in range(-(-len(targets) // 2048)):
+        found.append(data.fit(targets[chunk * 2048 : (chunk + 1) * 2048], settings))
+        tell(chunk + 1)
+    local = Local(*(np.concatenate([getattr(part, n) for part in found]) for n in ("eta", "sigma", "outside", "nearest")))
+    spacing = data.spacing(targets, settings)
+    far = ((local.outside > OUTSIDE) & (local.nearest > 0.7 * spacing)) | (local.nearest > 4.0 * spacing)
+    far &= ~measured
+    eta, sigma = local.eta.copy(), scale * local.sigma * np.sqrt(1.0 + (local.nearest / spacing) ** 2 / 4.0)
+    sigma *= _excess(data, settings, scale, targets)
+    if np.any(far):
+        straight = data.fit(targets[far], replace(settings, order=1, neighbours=max(settings.neighbours, 12)))
+        eta[far] = straight.eta
+        beyond = np.sqrt(np.maximum(straight.outside - 1.0, 0.0)) + straight.nearest / spacing[far] / 4.0
+        sigma[far] = np.hypot(np.maximum(scale, 1.0) * straight.sigma, 0.2 + 0.3 * beyond)
+    return eta, sigma, far
+
+
+class Data:
     """Samples in coordinates, ready for neighbour searches under changing settings."""
 
     def __init__(self, x: Array, f: Array, u: Array, known: bool) -> None:
@@ -177,6 +192,10 @@ class _Data:
         positive = f[f > 0]
         self.floor = max(1e-6 * float(np.quantile(positive, 0.99)), 0.3 * float(positive.min()))
         self._tree: tuple[tuple[float, float, float], object, Array] | None = None
+
+    def tangent(self) -> Array:
+        """tan(theta_h/2) of the samples, shape (n,)."""
+        return np.asarray(self.x[:, 0])
 
     def metric(self, x: Array, settings: Settings) -> Array:
         c2 = settings.c**2
@@ -200,11 +219,11 @@ class _Data:
         return np.asarray(np.maximum(np.median(distance[:, 3][index], axis=1), 1e-9))
 
     def fit(self, targets: Array, settings: Settings, leave_out: NDArray[np.int64] | None = None) -> Local:
-        """Local fits at the targets (m, 3); with `leave_out`, target j ignores sample leave_out[j]."""
+        """Local fits at the targets (m, k); with `leave_out`, target j ignores sample leave_out[j]."""
         tree, points = self.tree(settings)
         at = self.metric(targets, settings)
         k = min(settings.neighbours, len(points) - (leave_out is not None))
-        order = settings.order if k >= 14 else 1
+        order = settings.order if k >= 14 + 10 * (self.x.shape[1] - 3) else 1
         if leave_out is None:
             distance, index = tree.query(at, k)  # type: ignore[attr-defined]
         else:
@@ -215,9 +234,10 @@ class _Data:
         reach = 1.05 * distance[:, -1:] + 1e-12
         kernel = (1.0 - (distance / reach) ** 3) ** 3 + 1e-6
         z = (points[index] - at[:, None, :]) / reach[..., None]  # (m, k, 3)
-        columns = [np.ones(z.shape[:2]), z[..., 0], z[..., 1], z[..., 2]]
+        dimensions = z.shape[2]
+        columns = [np.ones(z.shape[:2]), *np.moveaxis(z, -1, 0)]
         if order == 2:
-            columns += [z[..., i] * z[..., j] for i in range(3) for j in range(i, 3)]
+            columns += [z[..., i] * z[..., j] for i in range(dimensions) for j in range(i, dimensions)]
         design = np.stack(columns, axis=-1)
         f, u2 = self.f[index], self.u[index] ** 2
 
@@ -247,7 +267,7 @@ class _Data:
         distance, index = tree.query(at, min(CLOUD, len(points)))  # type: ignore[attr-defined]
         z = (points[index] - at[:, None, :]) / (distance[:, -1:, None] + 1e-12)
         mean = z.mean(axis=1)
-        spread = np.swapaxes(z, 1, 2) @ z / z.shape[1] - mean[:, :, None] * mean[:, None, :] + 1e-4 * np.eye(3)
+        spread = np.swapaxes(z, 1, 2) @ z / z.shape[1] - mean[:, :, None] * mean[:, None, :] + 1e-4 * np.eye(z.shape[2])
         every = np.einsum("mi,mi->m", mean, np.linalg.solve(spread, mean[..., None])[..., 0])
         single = np.max(mean**2 / np.diagonal(spread, axis1=1, axis2=2), axis=1)
         return np.asarray(np.maximum(single, every / 2.0))
@@ -267,7 +287,7 @@ def _solve(design: Array, precision: Array, response: Array) -> tuple[Array, Arr
     return both[..., 0], both[..., 1]
 
 
-def _choose(data: _Data) -> tuple[Settings, float]:
+def choose(data: Data) -> tuple[Settings, float]:
     """Settings with the smallest leave-one-out error, one coordinate at a time, and the scale of the standard errors."""
     n = len(data.f)
     left_out = np.unique(np.linspace(0, n - 1, min(n, TRIALS)).astype(np.int64))
@@ -283,7 +303,10 @@ def _choose(data: _Data) -> tuple[Settings, float]:
         r, _ = residual(settings)
         return float(np.mean(np.minimum(np.abs(r), 0.5) ** 2))
 
-    best = Settings(neighbours=min(12, n - 1))
+    # a lobe narrower than the samples resolve would be a spike of our own making
+    near = np.sort(data.tangent()[data.tangent() > 1e-6])
+    finest = 0.5 * float(near[min(4, len(near) - 1)]) if len(near) else 1.0
+    best = Settings(c=max(0.1, finest), neighbours=min(12, n - 1))
     least = error(best)
     orders = [(1, 8), (1, 20), (2, 16), (2, 24), (2, 40), (2, 64)]
     ladder: list[dict[str, list[float]] | list[tuple[int, int]]] = [
@@ -298,7 +321,8 @@ def _choose(data: _Data) -> tuple[Settings, float]:
         if isinstance(rung, list):
             options = [replace(best, order=o, neighbours=k) for o, k in rung if k < n]
         else:
-            options = [replace(best, **{name: value}) for name, values in rung.items() for value in values]  # type: ignore[arg-type]
+            pairs = [(name, v) for name, values in rung.items() for v in values if name != "c" or v >= finest]
+            options = [replace(best, **{name: value}) for name, value in pairs]  # type: ignore[arg-type]
         for option in options:
             if option != best and (e := error(option)) < 0.995 * least:
                 best, least = option, e
@@ -321,7 +345,7 @@ def _choose(data: _Data) -> tuple[Settings, float]:
     return best, float(np.sqrt(low * high))
 
 
-def _excess(data: _Data, settings: Settings, scale: float, targets: Array) -> Array:
+def _excess(data: Data, settings: Settings, scale: float, targets: Array) -> Array:
     """Factor on the standard error at each target from the leave-one-out residuals around it.
 
     Where the surface bends more than a local polynomial follows, the residuals of the samples there say so.
@@ -340,7 +364,7 @@ def _excess(data: _Data, settings: Settings, scale: float, targets: Array) -> Ar
     return np.asarray(np.sqrt(np.maximum((pull2[index].sum(axis=1) + 4.0) / (index.shape[1] + 4.0), 1.0)))
 
 
-def _uncertainty(f: Array, u: Array) -> tuple[Array, bool]:
+def working_uncertainty(f: Array, u: Array) -> tuple[Array, bool]:
     """Working uncertainty of each sample, and whether it was known for most of them."""
     known = np.isfinite(u) & (u > 0)
     if np.count_nonzero(known) >= len(f) / 2:

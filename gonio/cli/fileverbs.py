@@ -140,9 +140,12 @@ def _material(output: Output, found: Any, model: str | None, attributes: dict[st
             tuple(p.brdf() for p in posteriors), channels, attributes={**told, "origin": "model", "model": model}
         )
     if several and len({round(float(p), 6) for p in found.phi_i}) > 1 and _grained(found):
-        raise DatasetError(
-            "the samples depend on the incident azimuth, and a table from samples is isotropic; choose a format of rows"
-        )
+        from gonio.brdf import grained
+
+        output.warn("the samples depend on the incident azimuth: the table keeps the grain")
+        with_grain = [grained.tabulate(one) for one in sets]
+        u = tuple(t.u_brdf() for t in with_grain)
+        return Material(tuple(t.brdf() for t in with_grain), channels, u, {**told, "origin": "table with a grain"})
     tables = [tabulate(one) for one in sets]
     return Material(
         tuple(t.brdf() for t in tables), channels, tuple(t.u_brdf() for t in tables), {**told, "origin": "table"}

@@ -103,13 +103,13 @@ class Material:
         return self.samples(wi, wr)
 
 
-def radial_deg(lobe_width: float, most: float) -> Array:
-    """Angles from the mirror direction [deg], ascending from 0: even within the lobe, then growing steps up to `most`."""
+def radial_deg(lobe_width: float, most: float, largest: float = 5.0) -> Array:
+    """Angles from the mirror direction [deg] from 0: even steps within the lobe, then growing ones, at most `largest`."""
     step = float(np.clip(np.degrees(2.0 * lobe_width) / 4.0, 0.02, 2.5))  # the reflected lobe is twice as wide
     out = [0.0]
     while out[-1] < most - 1e-9:
         grown = step * max(1.0, out[-1] / (8.0 * step))
-        out.append(min(round(out[-1] + min(grown, 5.0), 6), most))
+        out.append(min(round(out[-1] + min(grown, largest), 6), most))
     return np.array(out)
 
 

@@ -89,7 +89,7 @@ class SpecularTable:
         )  # fmt: skip
 
 
-def tabulate(material: Material, incidence_deg: Array, step_deg: float = 5.0) -> SpecularTable:
+def tabulate(material: Material, incidence_deg: Array) -> SpecularTable:
     """The table of a material: one channel, or X, Y, Z if it has linear RGB."""
     if material.channels.kind == "rgb":
         material = material.tristimulus()
@@ -97,9 +97,9 @@ def tabulate(material: Material, incidence_deg: Array, step_deg: float = 5.0) ->
     if len(material.channels) != len(channels):
         material = material.one()
     symmetric = material.isotropic
-    azimuth = np.arange(0.0, 181.0 if symmetric else 361.0, step_deg)
+    azimuth = np.arange(0.0, 181.0, 3.0) if symmetric else np.arange(0.0, 361.0, 10.0)
     rotation = np.array([0.0]) if symmetric else np.arange(0.0, 360.0, 15.0)
-    radial = radial_deg(material.lobe_width(), 175.0)
+    radial = radial_deg(material.lobe_width(), 175.0, 2.0 if symmetric else 5.0)
     empty = np.zeros((1, 1, 1, 1, 1))
     table = SpecularTable(rotation, incidence_deg, azimuth, radial, empty, empty[..., 0, 0], symmetric, channels)
     wr = table.directions()

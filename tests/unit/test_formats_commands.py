@@ -69,11 +69,19 @@ def test_sparse_data_go_through_a_table_or_a_model_and_say_so(tmp_path: Path, ca
     assert "f_r = dL_r / dE_i [1/sr]" in said.out
 
 
-def test_a_grain_cannot_become_an_isotropic_table_unseen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    formats.export("csv", tmp_path / "a.csv", samples=materials.brushed(0.1, 0.6).rows())
-    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "a.xml"), "--format", "klems"]) == 6
-    assert "depend on the incident azimuth" in capsys.readouterr().err
-    assert not (tmp_path / "a.xml").exists()
+@pytest.mark.gate
+def test_a_grain_is_kept_or_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    material = materials.turned(0.3, 0.3, 0.8)
+    rows = material.rows()
+    formats.export("csv", tmp_path / "a.csv", samples=rows.select(np.arange(0, len(rows), 8)))
+    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "a.bsdf"), "--format", "opticstudio"]) == 0
+    assert "the table keeps the grain" in capsys.readouterr().err
+    found = formats.read_channels(tmp_path / "a.bsdf")
+    low = (found.theta_i < 1.1) & (found.theta_r < 1.1)
+    assert np.median(np.abs(found.f_r / materials.truth(material, found) - 1)[low]) < 0.1
+    assert main(["convert", str(tmp_path / "a.csv"), str(tmp_path / "a.binary"), "--format", "merl"]) == 6
+    assert "holds isotropic BRDFs only" in capsys.readouterr().err
+    assert not (tmp_path / "a.binary").exists()
 
 
 def test_check_file_of_a_wrong_file_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
