@@ -37,7 +37,7 @@ _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
 _TILE = 1 << 15  # nodes evaluated at once: they stay in the cache
 _WORTH = 1 << 17  # nodes below which several threads gain nothing
 _LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
-_FEW = 64  # surface elements up to which cells are tried where no order suits a model made of pieces
+_FEW = 64  # surface elements up to which cells are tried where no order suits
 _NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
 _BROAD = 0.5  # lobe width [rad] from which a lobe does not matter for that choice
 
@@ -143,12 +143,18 @@ def integrate_cap(
         error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
         if np.all(done):
             break
-    rest = np.flatnonzero(crossed | ~done)
-    if (kinked or (term.model.pieces and cautious and rest.size <= _FEW)) and rest.size:  # edges that cross or are not known
+    missed = ~done
+    if not kinked:  # a few that no order suits, such as of tables, whose pieces have borders that are not known
+        missed &= unit * np.abs(value) < 0.1 * np.maximum(rtol * np.abs(value), atol)
+        missed &= cautious and np.count_nonzero(missed) <= _FEW
+    rest = np.flatnonzero(crossed | missed)
+    if rest.size:
         local = about_normal is not False
-        value[rest], error[rest] = over_cap(
+        by_cells, left = over_cap(
             term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort
         )
+        better = crossed[rest] | (left < error[rest])
+        value[rest[better]], error[rest[better]] = by_cells[better], left[better]
     return value, error
 
 
