@@ -15,6 +15,7 @@ from gonio.source import Cap
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+_BROAD = 0.1  # width of a lobe [rad]
 
 
 def over_cap(
@@ -45,11 +46,12 @@ def over_field(
     """Reflected radiance of each element due to one term and one field; its peaks, texels or detail are declared.
 
     Polar coordinates about the normal, or else about the field's own pole; by default the pole for an environment map, whose
-    rows are rings about it, unless the view is grazing, when more circles lie along the horizon; the normal for the others.
+    rows are rings about it, unless the view is grazing and the lobe broad, when more circles lie along the horizon; the
+    normal for the others.
     """
     if about_normal is None and isinstance(field, EnvironmentMap):
         value, error = np.zeros(len(elements)), np.zeros(len(elements))
-        grazing = elements.cos_theta < GRAZING
+        grazing = (elements.cos_theta < GRAZING) & ((term.lobe_width() or 1.0) >= _BROAD)  # a narrow one is a streak
         for local in (False, True):
             some = np.flatnonzero(grazing == local)
             value[some], error[some] = over_field(

@@ -44,14 +44,6 @@ EVERYWHERE = [
         "shadowing": "smith_separable",
     },
     {"model": "microfacet", "k_s": 1.0, "alpha": 0.2, "distribution": "ggx", "f_0": 0.5, "shadowing": "v_groove"},
-    {
-        "model": "microfacet",
-        "k_s": 1.0,
-        "alpha": 0.2,
-        "gamma": 3.0,
-        "f_0": 0.5,
-        "multiple_scattering": True,
-    },
 ]
 
 
