@@ -197,7 +197,7 @@ def test_replies_wait_for_their_delay_in_scaled_time() -> None:
 
 def test_bytes_are_paced_at_the_lines_speed() -> None:
     """Expected at 57.6 kbit/s: 10 bytes out, 0.5 ms of return delay, 14 bytes back: 4.67 rig ms."""
-    link = TcpLink(DynamixelBus([Servo(1)]), ScaledClock(0.001), baud=57_600)  # a rig millisecond is a wall second
+    link = TcpLink(DynamixelBus([Servo(1)]), ScaledClock(1e-5), baud=57_600)  # a rig millisecond is 100 s of wall
     with socket.create_connection(link.address) as client:
         (connection,) = (one for _ in range(100) for one in link.on_readable())
         client.sendall(PING)
@@ -207,20 +207,20 @@ def test_bytes_are_paced_at_the_lines_speed() -> None:
         first = connection.due()
         assert first is not None
         # 240 bits at 57.6 kbit/s and the return delay; the connection heard it no later than now
-        wait = 1000 * (240 / 57_600 + 500e-6)
+        wait = 1e5 * (240 / 57_600 + 500e-6)
         assert first - wait <= sent <= first
     link.close()
 
 
 @needs_pty
 def test_a_terminal_is_paced_at_the_speed_that_its_client_sets() -> None:
-    link = PtyLink(DynamixelBus([Servo(1, baud_code=1)]), ScaledClock(0.001), baud=1_000_000)
+    link = PtyLink(DynamixelBus([Servo(1, baud_code=1)]), ScaledClock(1e-5), baud=1_000_000)
     with serial.Serial(link.path, 57_600) as client:
         client.write(PING)
         while link.due() is None:
             link.on_readable()
         due = link.due()
-        assert due is not None and due - time.monotonic() > 1000 * 230 / 57_600
+        assert due is not None and due - time.monotonic() > 1e5 * 230 / 57_600
     link.close()
 
 
