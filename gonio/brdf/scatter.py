@@ -39,6 +39,7 @@ from gonio.brdf.base import Model, Parameter
 from gonio.brdf.elementary import exp, log1p, power
 
 Array = NDArray[np.float64]
+_CUSP = 0.03
 SIXTEEN_PI2 = 16.0 * math.pi**2
 
 
@@ -66,8 +67,11 @@ def k_correlation_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr:
 
 
 def _abg_width(p: Array) -> float:
-    """Where d^g = B: the peak's roll-off."""
-    return 0.5 * float(p[1]) ** (1.0 / p[2]) if p[2] > 0.0 else 1.0
+    """Where d^g = B: the peak's roll-off; far below it where d^g is a cusp, so that nodes crowd towards it."""
+    if p[2] == 0.0:
+        return 1.0
+    width = 0.5 * float(p[1]) ** (1.0 / float(p[2]))
+    return width if p[2] in (2.0, 4.0) else _CUSP * width
 
 
 def _harvey_width(p: Array) -> float:
