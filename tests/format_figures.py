@@ -73,7 +73,7 @@ def random_pairs(n: int, seed: int, reach_deg: float = 75.0) -> tuple[Array, Arr
     return wi, np.where(take[:, None], near, wr)
 
 
-def albedo(read: Reader, theta_i: float, n: int = 48) -> float:
+def albedo(read: Reader, theta_i: float, n: int = 96) -> float:
     """Directional albedo by Gauss quadrature in half-vector angles around the mirror direction."""
     node, weight = np.polynomial.legendre.leggauss(n)
     wi = np.array([math.sin(theta_i), 0.0, math.cos(theta_i)])

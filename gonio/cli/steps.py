@@ -227,7 +227,7 @@ def compute_map(
 def export(run: Run, name: str, path: Path, output: Output) -> None:
     """Write the data set of a run in one format."""
     from gonio import formats
-    from gonio.formats.quantity import QUANTITIES
+    from gonio.formats.quantity import SHORT
 
     samples = run.read_samples() if run.has_samples() else None
     table = load_table(run) if run.table_path.exists() else None
@@ -246,7 +246,7 @@ def export(run: Run, name: str, path: Path, output: Output) -> None:
     )
     form = formats.FORMATS[name]
     stated = form.quantity or "brdf"
-    output.say(f"wrote {path}: {QUANTITIES[stated]}; {form.doc}")
+    output.say(f"wrote {path}: {SHORT[stated]}, {form.doc}")
     output.result(file=path, format=name, quantity=stated)
 
 

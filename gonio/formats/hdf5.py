@@ -18,7 +18,7 @@ from gonio import files
 from gonio.errors import DatasetError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-SECONDS = 60
+SECONDS = 20
 CHILD = Path(__file__).with_name("hdf5_child.py")
 
 

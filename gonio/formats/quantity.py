@@ -24,6 +24,7 @@ QUANTITIES = {
     "brf": "bidirectional reflectance factor pi f_r [1]",
     "brdf_cos": "cosine-corrected BRDF f_r cos(theta_r) [1/sr]",
 }
+SHORT = {"brdf": "f_r in 1/sr", "brf": "pi f_r, without a unit", "brdf_cos": "f_r cos(theta_r) in 1/sr"}
 
 
 def check(quantity: str) -> str:

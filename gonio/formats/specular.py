@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.channels import SINGLE, XYZ, Channels, ChannelSamples
-from gonio.errors import DatasetError
+from gonio.errors import DatasetError, IntegrationError
 from gonio.formats.material import Material, around_mirror, radial_deg
 from gonio.geometry import angles
+from gonio.integrate import directional_albedo
 
 Array = NDArray[np.float64]
 
@@ -111,8 +112,20 @@ def tabulate(material: Material, incidence_deg: Array) -> SpecularTable:
         spin = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         value[:, k] = material.evaluate(np.broadcast_to((wi @ spin.T)[:, None, None, :], wr.shape), wr @ spin.T)
     value = np.where(wr[..., 2] > 1e-9, np.maximum(value, 0.0), 0.0)
-    tis = integrated(value, wr, azimuth, radial, symmetric)
+    tis = _scatter(material, theta) if symmetric else integrated(value, wr, azimuth, radial, symmetric)
     return replace(table, value=value, tis=tis, attributes=material.attributes)
+
+
+def _scatter(material: Material, theta: Array) -> Array:
+    """Total integrated scatter of an isotropic material at the incidences, shape (c, 1, incidences)."""
+    each = []
+    for brdf in material.brdfs:
+        try:
+            each.append(np.array([float(directional_albedo(brdf, t, rtol=1e-3).value) for t in theta]))
+        except IntegrationError as error:
+            raise DatasetError(f"the scatter of the material cannot be integrated: {error}") from error
+    found = np.stack(each)
+    return np.asarray((found if material.mix is None else material.mix @ found)[:, None, :])
 
 
 def integrated(value: Array, wr: Array, azimuth_deg: Array, radial_deg: Array, symmetric: bool) -> Array:
