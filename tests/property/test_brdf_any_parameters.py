@@ -55,7 +55,7 @@ def random_sets(name: str, choices: dict[str, Any], count: int, seed: int) -> It
         yield given
 
 
-@pytest.mark.parametrize("model", [*MODELS, *BARE], ids=_named)
+@pytest.mark.parametrize("model", [*MODELS, *BARE, REPEATED[0]], ids=_named)
 def test_any_parameters(model: tuple[str, dict[str, Any]]) -> None:
     name, choices = model
 
