@@ -21,6 +21,7 @@ EPS = float(np.finfo(float).eps)
 MOST_DIGITS = 14.0
 NONE = 1e9  # [rad], a width that means: no such feature
 FIRST_WAVES = 48
+_AT_LAYERS = 2.0  # digits more
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +54,15 @@ class Scene:
         corner = self._corner(digits)
         edges, detail = (self.rings.breaks, np.zeros(1)) if self.rows else self.rings.groups
 
+        # a layer finer than the lobe has no nearest pole for the orders to count with
+        more = _AT_LAYERS if self.term.model.layer_width is not None else 0.0
+
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
                 slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile],
                 corner, edges, detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
-                digits * math.log(10.0), x, w, out[tile], effort,
+                (digits + more) * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
 
