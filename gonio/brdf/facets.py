@@ -15,7 +15,7 @@ horizon and a sum of nothing but positive terms. With y = mu / (alpha sin theta)
   polynomial in y / (y + 4), to 1e-16;
 - ggx: :math:`M = \tfrac12\alpha^2 s^2/(\sqrt{\mu^2+\alpha^2 s^2}+\mu)`;
 - std: exact by the incomplete beta function, tabulated when gamma is set, to 1e-13;
-- gtr: an integral over the slopes, tabulated when alpha and gamma are set, to 1e-13 (1e-10 below alpha = 1e-3).
+- gtr: an integral over the slopes, tabulated when alpha and gamma are set, to 1e-13.
 
 References
 ----------
@@ -221,7 +221,7 @@ def _gamma_ratio(z: float) -> float:
 
 # --- gtr ------------------------------------------------------------------------------------------------------------------
 
-_GTR_PIECES = 8
+_GTR_PIECES = 12
 
 
 def _density_gtr(at: int) -> Any:

@@ -91,15 +91,16 @@ def _conductor(at: int) -> Any:
         n, k, c2 = p[at], p[at + 1], 0.25 * l2
         c = math.sqrt(c2)
         m_re, m_im = (n - 1.0) * (n + 1.0) - k * k, 2.0 * n * k  # m^2 - 1
+        square = (n - k) * (n + k)  # Re m^2
         # q = a + i b: a^2 - b^2 = w, a b = n k; the larger of a^2, b^2 is a sum
-        w = m_re + c2
+        w = square - 0.25 * e2 if e2 < l2 else m_re + c2
         larger = 0.5 * (math.sqrt(w * w + m_im * m_im) + abs(w))
         smaller = 0.25 * m_im * m_im / (larger if larger > 0.0 else 1.0)
         a, b = math.sqrt(larger if w > 0.0 else smaller), math.sqrt(smaller if w > 0.0 else larger)
         s2 = (a + c) * (a + c) + b * b  # |q + c|^2
-        u_re, u_im = (m_re + 1.0) * c + a, m_im * c + b
+        u_re, u_im = square * c + a, m_im * c + b
         u2 = u_re * u_re + u_im * u_im  # |m^2 c + q|^2
-        v_re, v_im = m_re * c2 + (c2 - 0.25 * e2), m_im * c2
+        v_re, v_im = square * c2 - 0.25 * e2, m_im * c2
         s4, u4 = s2 * s2, u2 * u2
         return 0.5 * (m_re * m_re + m_im * m_im) * (u4 + (v_re * v_re + v_im * v_im) * s4), s4 * u4
 

@@ -377,7 +377,7 @@ INLINE pieces(double x, const double *restrict table, long count)
 INLINE gtr_m(double mu, double s2, const double *restrict p)
 {
     double b = p[5], r = sqrt(mu * mu + b * b * s2);
-    return s2 * pieces(log((mu + r) / b) * p[6], p + 7, 8);
+    return s2 * pieces(log((mu + r) / b) * p[6], p + 7, 12);
 }
 
 MODEL(microfacet_gtr)
