@@ -34,7 +34,9 @@ from gonio.integrate.ring_nodes import (
     turn_of,
 )
 
-SERIES = 1.15  # z of the wave that takes degree 11 to 1e-12, which a panel of a sampled field has (`spectrum`)
+# a panel of a sampled field has degree 11 to 1e-12 (`spectrum`)
+SERIES = 1.15  # as has a wave of z = m h = 1.15
+GAUSSIAN = 0.36  # as has a Gaussian lobe that is as wide; over many panels it has waves up to sqrt(2 digits) over its width
 
 
 @jit.part
@@ -100,8 +102,9 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                 if rows:
                     bend += 0.5 * degree
                 else:
-                    z = SERIES * (b - a) * finest_detail(edges, detail, a, b)
-                    bend, beyond = bend + 0.5 * z, max(beyond, 0.5 * (digits * digits * z) ** (1.0 / 3.0))
+                    panels_across = (b - a) * finest_detail(edges, detail, a, b)
+                    bend += GAUSSIAN * math.sqrt(digits) * panels_across
+                    beyond = max(beyond, 0.5 * (SERIES * digits * digits * min(1.0, panels_across)) ** (1.0 / 3.0))
                 order, starts, ends = theta_order(
                     a, b, touch, touching, theta_n, width, layer, peaks[slope], bend, beyond, digits
                 )

@@ -142,3 +142,18 @@ def test_broken_powers_and_sharp_lobes_against_independent_values(n: float) -> N
         assert all(step.method is Method.RINGS for step in got.plan)
         off = np.abs(got.value[:3] - truth) - 2e-11 * truth
         assert np.all(off <= got.error[:3]) and np.all(off <= rtol * truth)
+
+
+def test_a_sharp_lobe_on_paper_against_independent_values() -> None:
+    """Errors of tables are differences of sums, which see nothing that these have in common: too few rings for the lobe."""
+    part = {"kind": "lobes", "amplitude": 2.0, "kappa": 1e4, "theta": 0.7, "phi": 1.0}
+    grid_p, grid_q = np.meshgrid(np.linspace(-0.6, 0.4, 11), np.linspace(-0.55, 0.3, 11))
+    p, q = np.append(grid_p, [0.3, -0.35]), np.append(grid_q, [-0.5, -0.1])
+    scenes = [
+        {"brdf": [{"model": "lambertian", "albedo": 0.3}], "source": [part], "p": p[k], "q": q[k]} for k in (-2, -1)
+    ]
+    truth = np.array([reflected_radiance(scene, "normal", 1e-11) for scene in scenes])
+    for rtol in (1e-3, 1e-6):
+        got = gonio.reflectance_map(make_brdf("lambertian", albedo=0.3), make_source(**part), p, q, rtol=rtol)
+        off = np.abs(got.value[-2:] - truth) - 2e-11 * truth
+        assert np.all(off <= got.error[-2:]) and np.all(off <= rtol * truth)
