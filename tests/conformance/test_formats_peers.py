@@ -45,7 +45,7 @@ def test_mitsuba_renders_the_reflectance_map(tmp_path: Path) -> None:
 @needs("mitsuba")
 def test_mitsuba_reads_a_grain_with_its_azimuth(tmp_path: Path) -> None:
     """A mirror-symmetric grain turned by 30 degrees is not its own mirror image, so a flipped azimuth would show."""
-    turned = materials.turned(math.radians(30), 0.45, 0.9)
+    turned = materials.turned(math.radians(30), 0.3, 0.6)
     formats.export("rgl", tmp_path / "a.bsdf", material=turned)
     bsdf = peers.mitsuba_bsdf(tmp_path / "a.bsdf")
     wi, wr = format_figures.random_pairs(300, 4, 60.0)
