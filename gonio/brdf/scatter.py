@@ -70,8 +70,8 @@ def _abg_width(p: Array) -> float:
     """Where d^g = B: the peak's roll-off; far below it where d^g is a cusp, so that nodes crowd towards it."""
     if p[2] == 0.0:
         return 1.0
-    width = 0.5 * float(p[1]) ** (1.0 / float(p[2]))
-    return width if p[2] in (2.0, 4.0) else _CUSP * width
+    width: float = 0.5 * float(p[1]) ** (1.0 / float(p[2]))
+    return width if float(p[2]) in (2.0, 4.0) else float(_CUSP * width)
 
 
 def _harvey_width(p: Array) -> float:
