@@ -30,7 +30,7 @@ LIMIT = 1e-12
 
 
 def long(x: mpf) -> np.longdouble:
-    return Long(mpmath.nstr(x, 25))
+    return Long(mpmath.nstr(x, 25)) if abs(x) > mpf("1e-4000") else Long(0)
 
 
 @functools.cache
