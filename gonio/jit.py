@@ -53,7 +53,7 @@ def model(function: Callable[..., Any]) -> Any:
 def part(function: Callable[..., Any], **options: Any) -> Any:
     """Compile a function that kernels call, inlined where the compiler finds it worthwhile; options of ``numba.njit``."""
     key = hashlib.sha256(repr(_fingerprint(function, set())).encode()).hexdigest()
-    return numba.njit(error_model="numpy", fastmath=False, **_BARE, **options)(_named(function, key))
+    return numba.njit(**{"error_model": "numpy", "fastmath": False} | _BARE | options)(_named(function, key))
 
 
 def kernel(function: Callable[..., Any], *, apart: bool = False, **options: Any) -> Any:

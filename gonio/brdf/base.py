@@ -116,6 +116,8 @@ class Model:
     features : callable, optional
         ``(p, omega_r (3,)) -> (k, 4)``: narrow structures elsewhere than at the mirror direction, as a function of omega_i
         for the given omega_r: rows of a unit vector and a half width [rad], such as an opposition peak's.
+    shadowed : bool
+        Whether a model with a lobe may change within the lobe's width along the horizon, too. False: it is analytic there.
     derived : callable, optional
         Of the parameters (n,): numbers (m,) that depend on them only and that the function finds behind them in the
         parameter array, such as a table of albedos.
@@ -148,6 +150,7 @@ class Model:
     derived: Callable[[Array], Array] | None = None
     derived_slopes: Callable[[Array], Array] | None = None
     array_function: Callable[[Array, Array, Array], Array] | None = None
+    shadowed: bool = True
     diffuse: bool = False
     isotropic: bool = True
     reciprocal: bool = True

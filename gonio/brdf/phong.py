@@ -93,6 +93,7 @@ PHONG = Model(
     lobe_width=_width,
     kinks=_kinks,
     kink_power=_kink_power,
+    shadowed=False,
 )
 
 

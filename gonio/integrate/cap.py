@@ -40,6 +40,8 @@ from gonio import jit
 Array = NDArray[np.float64]
 HALF_PI = 0.5 * math.pi
 TWO_PI = 2.0 * math.pi
+NO_LAYER = 10.0  # depth that stands for no structure at the horizon
+_ROOT_HALF = math.sqrt(0.5)
 MAX_FEATURES = 24
 MAX_PANELS = 32
 MAX_ARCS = 24
@@ -198,7 +200,10 @@ def half_ring(a, b, eps, near, edge, sign, x, w, cosines, sines, weights, count)
 
 @jit.model
 def frame(cos_n, sin_n, ax, ay, az, half_angle, about_normal, g):  # type: ignore[no-untyped-def]
-    """Geometry of the rings into g: 0-2 u, 3-5 v, 6-8 pole, 9 gamma, 10 delta, 11 t_end, 12 t_m, 13 chi_m."""
+    """Geometry of the rings into g: 0-2 u, 3-5 v, 6-8 pole, 9 gamma, 10 delta, 11 t_end, 12 t_m, 13 chi_m.
+
+    Then 14-17: sin and cos of (delta - gamma) / 2 and of (delta + gamma) / 2.
+    """
     if about_normal:
         px, py, pz, cx, cy, cz = 0.0, 0.0, 1.0, ax, ay, az
         delta, t_end = half_angle, HALF_PI
@@ -225,6 +230,8 @@ def frame(cos_n, sin_n, ax, ay, az, half_angle, about_normal, g):  # type: ignor
     g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8] = ux, uy, uz, vx, vy, vz, px, py, pz
     g[9], g[10], g[11] = gamma, delta, t_end
     g[12], g[13] = math.atan2(math.hypot(m1, m2), m3), math.atan2(m2, m1)
+    g[14], g[15] = math.sin(0.5 * (delta - gamma)), math.cos(0.5 * (delta - gamma))
+    g[16], g[17] = math.sin(0.5 * (delta + gamma)), math.cos(0.5 * (delta + gamma))
 
 
 @jit.model
@@ -245,7 +252,7 @@ def ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features)
     """Where the integrand across the rings needs nodes: cuts, the lobe, layers at the horizon, kinks."""
     gamma, delta, t_end, t_m, chi_m = g[9], g[10], g[11], g[12], g[13]
     lobe = width < 10.0
-    layer = max(min(depth, cos_n), 1e-15)
+    layer = max(min(depth, cos_n), 1e-15) if depth < NO_LAYER else NO_LAYER
     n = 0
     if delta < math.pi:
         for k in range(3):
@@ -277,7 +284,7 @@ def ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features)
                         n = add(features, n, t, max(scale, 1e-15), False, t_end)
     if lobe:
         n = add(features, n, t_m, 2.0 * width * (1.0 if about_normal else max(cos_n, width)), False, t_end)
-        if about_normal:
+        if about_normal and layer < NO_LAYER:
             n = add(features, n, HALF_PI, layer, False, t_end)
     for k in range(planes.shape[0]):
         cz = planes[k, 0] * g[6] + planes[k, 1] * g[7] + planes[k, 2] * g[8]
@@ -303,13 +310,14 @@ def insert(points, n, chi):  # type: ignore[no-untyped-def]
 
 
 @jit.model
-def arcs(t, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-def]
+def arcs(sh, ch, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-def]
     """Azimuths that bound the pieces of a ring, ascending, into points; 0 if all of it is cut away."""
-    gamma, delta, chi_m = g[9], g[10], g[13]
+    delta, chi_m = g[10], g[13]
     lower, upper, whole = chi_m - math.pi, chi_m + math.pi, True
     if delta < math.pi:
-        inside = math.sin(0.5 * (delta + t - gamma)) * math.sin(0.5 * (delta - t + gamma))
-        beyond = math.sin(0.5 * (t + gamma + delta)) * math.sin(0.5 * (t + gamma - delta))
+        # products of sines of half of delta -+ (gamma - t) and of t + gamma +- delta
+        inside = (g[14] * ch + g[15] * sh) * (g[16] * ch - g[17] * sh)
+        beyond = (sh * g[17] + ch * g[16]) * (sh * g[15] - ch * g[14])
         if inside <= 0.0:
             return 0, whole
         if beyond > 0.0:
@@ -358,7 +366,7 @@ def element_nodes(  # type: ignore[no-untyped-def]
     ux, uy, uz, vx, vy, vz, px, py, pz = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]
     ax, ay, az, t_m, chi_m = axis[0], axis[1], axis[2], g[12], g[13]
     lobe = width < 10.0
-    layer = max(min(depth, cos_n), 1e-15)
+    layer = max(min(depth, cos_n), 1e-15) if depth < NO_LAYER else NO_LAYER
     n_features = ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features)
     n_panels = split(features, n_features, g[11], panels)
     cm, sm = math.cos(chi_m), math.sin(chi_m)
@@ -373,12 +381,15 @@ def element_nodes(  # type: ignore[no-untyped-def]
         for i in range(x.size):
             y, dt = ring_position(x[i], w[i], panel, u0, u1)
             t = centre + y
-            st, ct = math.sin(t), math.cos(t)
             if centre == HALF_PI:
-                st, ct = math.cos(y), -math.sin(y)
+                a, b = math.sin(0.5 * y), math.cos(0.5 * y)
+                sh, ch, st, ct = _ROOT_HALF * (b + a), _ROOT_HALF * (b - a), (b - a) * (b + a), -2.0 * a * b
+            else:
+                sh, ch = math.sin(0.5 * t), math.cos(0.5 * t)
+                st, ct = 2.0 * sh * ch, (ch - sh) * (ch + sh)
             if t <= 0.0 or t >= g[11] or (about_normal and ct <= 0.0):
                 continue
-            n_points, whole = arcs(t, st, ct, symmetric, planes, g, points)
+            n_points, whole = arcs(sh, ch, st, ct, symmetric, planes, g, points)
             eps = ring_eps(t, st, ct, cos_n, sin_n, t_m, about_normal, width) if lobe else 1.0
             m = 0
             for piece in range(n_points - 1):
@@ -389,7 +400,7 @@ def element_nodes(  # type: ignore[no-untyped-def]
                 b = c1 - turn * math.pi if even else (turn + 1) * math.pi - c0
                 a, b = max(a, 0.0), min(b, math.pi)
                 near = edge = 10.0
-                if lobe and not about_normal and not whole:
+                if lobe and layer < NO_LAYER and not about_normal and not whole:
                     first, last = piece == 0 and not symmetric, piece == n_points - 2
                     if first or last:
                         slope = sin_gamma * st * abs(math.sin((c1 if last else c0) + chi_m))
@@ -421,7 +432,7 @@ def _ring_nodes(  # type: ignore[no-untyped-def]
 ):
     size = 2 * MAX_ARCS * x.size
     scratch = (
-        np.empty(14), np.empty((MAX_FEATURES, 3)), np.empty((MAX_PANELS, 6)), np.empty(MAX_ARCS),
+        np.empty(18), np.empty((MAX_FEATURES, 3)), np.empty((MAX_PANELS, 6)), np.empty(MAX_ARCS),
         np.empty(size), np.empty(size), np.empty(size),
     )  # fmt: skip
     count = 0

@@ -9,7 +9,7 @@ r"""The memo's special cases: one evaluation each, no quadrature.
 15b, 15c, mirror, cap  :math:`\rho L_i(2\theta_n, \phi_n)`
 =====================  ===============================================================================
 
-Each returns the value and a bound of its rounding error.
+Each returns the value and a bound of its rounding error. Lambert's are in `gonio.integrate.diffuse`.
 
 References
 ----------
@@ -51,21 +51,6 @@ def diffuse_albedo(term: Term) -> float:
     assert term.model.function is not None
     function = getattr(term.model.function, "py_func", term.model.function)
     return term.weight * math.pi * float(function(0.0, 0.0, 1.0, 0.0, 0.0, 1.0, term.values))
-
-
-def lambertian_cap(term: Term, cap: Cap, elements: Elements) -> tuple[Array, Array]:
-    """14b and 14c: a diffuse surface under a uniform sphere or a uniform hemisphere of any axis."""
-    rho = diffuse_albedo(term)
-    if cap.half_angle >= np.pi:
-        value = np.full(len(elements), rho * cap.radiance)
-    else:
-        value = 0.5 * rho * cap.radiance * (1.0 + elements.local(cap.axis)[:, 2])
-    return value, np.full(len(elements), 8.0 * EPS * rho * cap.radiance)
-
-
-def is_lambertian_cap(term: Term, cap: Cap) -> bool:
-    """Whether `lambertian_cap` holds."""
-    return term.model.diffuse and cap.profile is None and (cap.half_angle >= np.pi or cap.half_angle == np.pi / 2)
 
 
 def mirror_cap(term: Term, cap: Cap | Field, elements: Elements) -> tuple[Array, Array]:

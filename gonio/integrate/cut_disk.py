@@ -125,8 +125,7 @@ def insert(cuts, n, y):  # type: ignore[no-untyped-def]
 
 @functools.cache
 def _kernel(function: Any) -> Any:
-    @jit.model
-    def pieces(  # type: ignore[no-untyped-def]
+    def all_pieces(  # type: ignore[no-untyped-def]
         ax, ay, az, s, c, half_angle, planes, parameters, x, w, starts, rtol, floor, some, cuts, edges, counts
     ):
         """Integral of f_r cos theta_i over the disk around a; negative if it is not a case for this rule."""
@@ -236,10 +235,12 @@ def _kernel(function: Any) -> Any:
             if before >= 0.0:
                 step = abs(total - before)
                 estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
-                if estimate <= max(0.25 * rtol * total, floor):
+                if estimate <= max(0.25 * rtol * total, 0.1 * floor):
                     return total
             earlier, before = before, total
         return -1.0
+
+    pieces = jit.part(all_pieces, fastmath=jit.FAST)  # its sums vectorise
 
     def cut_disks(  # type: ignore[no-untyped-def]
         p, q, crossed, planes, axis, half_angle, scale, width, parameters, x, w, starts, rtol, floor,

@@ -1,7 +1,6 @@
 """Gradients of any shape as one long list that is worked on tile by tile, without copies of a grid's axes.
 
-Also what is so cheap that it is computed gradient by gradient in one compiled loop: beams (14a) and diffuse surfaces under
-hemispheres (14b, 14c).
+Also beams (14a), which are so cheap that they are computed gradient by gradient in one compiled loop.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from gonio import jit
 from gonio.brdf.base import Term
 from gonio.errors import GeometryError
-from gonio.integrate.closed_forms import diffuse_albedo
 from gonio.integrate.frames import Elements
-from gonio.source import Cap, Collimated
+from gonio.source import Collimated
 
 Array = NDArray[np.float64]
 EPS = float(np.finfo(float).eps)
 TILE = 1 << 14  # gradients
+BLOCK = 256  # gradients whose cosines are taken together
 _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
 
 
@@ -89,34 +88,46 @@ def cosines(x, y):  # type: ignore[no-untyped-def]
     return c, slope * c, -x / slope, -y / slope
 
 
+@jit.part
+def block(p, q, start, stop, rows):  # type: ignore[no-untyped-def]
+    """`cosines` of the gradients from `start` on, up to 256 of one row of the grid, into rows 0-3 of (6, 256); how many.
+
+    The loop over those of a normal size has no branch and vectorises; the others, such as 0, are few.
+    """
+    columns = p.shape[1]
+    i = start // columns
+    first = start - i * columns
+    n = min(min(columns - first, stop - start), BLOCK)
+    x, y, c, s, cf, sf = rows[4], rows[5], rows[0], rows[1], rows[2], rows[3]
+    odd = False
+    for k in range(n):
+        x[k], y[k] = p[i, first + k], q[i, first + k]
+    for k in range(n):
+        squared = x[k] * x[k] + y[k] * y[k]
+        usual = (squared > 1e-200) & (squared < 1e200)
+        odd |= not usual
+        squared = squared if usual else 1.0
+        across = 1.0 / math.sqrt(squared)
+        cosine = 1.0 / math.sqrt(1.0 + squared)
+        c[k], s[k], cf[k], sf[k] = cosine, squared * across * cosine, -x[k] * across, -y[k] * across
+    if odd:
+        for k in range(n):
+            c[k], s[k], cf[k], sf[k] = cosines(x[k], y[k])
+    return n
+
+
 def _all_cosines(p, q, start, out):  # type: ignore[no-untyped-def]
-    columns = p.shape[1]
-    for k in range(out.shape[1]):
-        i = (start + k) // columns
-        j = start + k - i * columns
-        out[0, k], out[1, k], out[2, k], out[3, k] = cosines(p[i, j], q[i, j])
-
-
-def _all_facing(p, q, start, stop, axis, a, b, slack, value, error):  # type: ignore[no-untyped-def]
-    columns = p.shape[1]
-    for k in range(start, stop):
-        i = k // columns
-        c, s, cf, sf = cosines(p[i, k - i * columns], q[i, k - i * columns])
-        value[k] += a + b * ((axis[0] * cf + axis[1] * sf) * s + axis[2] * c)
-        error[k] += slack
+    rows = np.empty((6, BLOCK))
+    done = 0
+    while done < out.shape[1]:
+        n = block(p, q, start + done, start + out.shape[1], rows)
+        for r in range(4):
+            for k in range(n):
+                out[r, done + k] = rows[r, k]
+        done += n
 
 
 _cosines = jit.kernel(_all_cosines, fastmath=False)
-_facing = jit.kernel(_all_facing, fastmath=False)
-
-
-def add_diffuse(term: Term, cap: Cap, gradients: Gradients, tile: tuple[int, int], value: Array, error: Array) -> float:
-    """14b and 14c on one tile: adds value and error; returns the largest relative error."""
-    full = diffuse_albedo(term) * cap.radiance
-    half = cap.half_angle < math.pi
-    a, b = (0.5 * full, 0.5 * full) if half else (full, 0.0)
-    _facing(gradients.p, gradients.q, *tile, np.array(cap.axis), a, b, 8.0 * EPS * full, value, error)
-    return 8.0 * EPS
 
 
 def add_beam(term: Term, beam: Collimated, gradients: Gradients, tile: tuple[int, int], value: Array, error: Array) -> float:
@@ -131,20 +142,24 @@ def add_beam(term: Term, beam: Collimated, gradients: Gradients, tile: tuple[int
 @functools.cache
 def _beam(function: Any) -> Any:
     def all_beams(p, q, start, stop, direction, parameters, weight, slack, value, error):  # type: ignore[no-untyped-def]
-        columns, worst = p.shape[1], 0.0
         x, y, z = direction[0], direction[1], direction[2]
-        for k in range(start, stop):
-            i = k // columns
-            c, s, cf, sf = cosines(p[i, k - i * columns], q[i, k - i * columns])
-            along = x * cf + y * sf
-            zi = along * s + z * c
-            if zi > 0.0:
-                f = function(along * c - z * s, y * cf - x * sf, zi, -s, 0.0, c, parameters)
-                lit = weight * f * zi
-                relative = slack + 4.0 * EPS / max(zi, EPS)
-                value[k] += lit
-                error[k] += lit * relative
-                worst = max(worst, relative)
+        rows, lit = np.empty((6, BLOCK)), np.empty((2, BLOCK))
+        total, relative = lit[0], lit[1]
+        c, s, cf, sf = rows[0], rows[1], rows[2], rows[3]
+        worst, done = 0.0, start
+        while done < stop:
+            n = block(p, q, done, stop, rows)
+            for k in range(n):
+                along = x * cf[k] + y * sf[k]
+                zi = along * s[k] + z * c[k]
+                f = function(along * c[k] - z * s[k], y * cf[k] - x * sf[k], zi, -s[k], 0.0, c[k], parameters)
+                total[k] = weight * f * zi if zi > 0.0 else 0.0
+                relative[k] = slack + 4.0 * EPS / (zi if zi > EPS else EPS) if zi > 0.0 else 0.0
+            for k in range(n):
+                value[done + k] += total[k]
+                error[done + k] += total[k] * relative[k]
+                worst = max(worst, relative[k])
+            done += n
         return worst
 
     return jit.kernel(all_beams, fastmath=False)

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.fields import EnvironmentMap, Field
-from gonio.integrate import closed_forms, disk, quadtree, radial
+from gonio.integrate import closed_forms, diffuse, disk, quadtree, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.frames import Elements
-from gonio.integrate.grid import Gradients, add_beam, add_diffuse
+from gonio.integrate.grid import Gradients, add_beam
 from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
@@ -88,7 +88,7 @@ class Run:
         if not isinstance(part, Cap):
             return None
         if step.method is Method.LAMBERT:
-            return lambda tile, value, error: add_diffuse(term, part, grid, tile, value, error)
+            return lambda tile, value, error: diffuse.add(term, part, grid, tile, value, error)
         if step.method is Method.RADIAL and grid.size > _FEW:
             table = self._table(step, part, threads)
             return functools.partial(table.add, grid)
@@ -96,8 +96,9 @@ class Run:
 
     def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
         """Most gradients by rules for small disks, the others by the general rule."""
+        floor = disk.negligible(step.term, cap, self.gradients)
         done = tiling.run(
-            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, value, error),
+            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, floor, value, error),
             self.gradients.tiles(),
             threads,
         )
@@ -105,7 +106,7 @@ class Run:
         worst = max((relative for relative, _, _ in done), default=0.0)
         left = np.concatenate([index for _, _, index in done]) if done else np.empty(0, dtype=np.intp)
         if left.size:
-            v, e = self._by_element(step, self.gradients.elements().select(left), threads)
+            v, e = self._by_element(step, self.gradients.select(left).elements(), threads)
             value[left] += v
             error[left] += e
             worst = max(worst, float(np.max(np.divide(e, np.abs(v), out=np.zeros_like(e), where=v != 0))))
@@ -210,8 +211,6 @@ class Run:
             return closed_forms.mirror_cap(term, part, elements)
         if isinstance(part, Field):
             return over_field(term, part, elements, rtol=self.rtol, atol=self.atol, effort=step.effort)
-        if step.method is Method.LAMBERT:
-            return closed_forms.lambertian_cap(term, part, elements)
         return integrate_cap(
             term, part, elements, rtol=self.rtol, atol=self.atol, about_normal=None, effort=step.effort, threads=threads
         )

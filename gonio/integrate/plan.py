@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from gonio.brdf.base import BRDF, Term
 from gonio.fields import Field
-from gonio.integrate import closed_forms
+from gonio.integrate import diffuse
 from gonio.integrate.quadrature import Effort
 from gonio.source import Collimated, Part, Source
 
@@ -17,7 +17,7 @@ class Method(enum.Enum):
 
     ZERO = "skipped"
     BEAM = "closed form 14a"
-    LAMBERT = "closed form 14b, 14c"
+    LAMBERT = "closed form of a diffuse surface"
     MIRROR = "closed form 15b, 15c"
     IMPULSE = "closed form 15a"
     RADIAL = "one-dimensional in theta_n"
@@ -82,8 +82,8 @@ def _step(term: Term, part: Part) -> Step:
         return Step(term, part, Method.RINGS, "isotropic: one kernel for all phi_n, the field's waves apart")
     if isinstance(part, Field):
         return Step(term, part, Method.FIELD, "a radiance field: cells between its edges and the surface's horizon")
-    if closed_forms.is_lambertian_cap(term, part):
-        return Step(term, part, Method.LAMBERT, "a diffuse surface under a uniform sphere or hemisphere")
+    if diffuse.suits(term, part):
+        return Step(term, part, Method.LAMBERT, "a diffuse surface under a uniform sphere, hemisphere or disk")
     if term.model.isotropic and part.axis in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
         return Step(term, part, Method.RADIAL, "symmetric about the view axis: R depends on theta_n only; half the azimuths")
     if not term.plain:

@@ -22,7 +22,7 @@ from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import edge_rounding
-from gonio.integrate.cap import NODE_ROWS, ring_nodes, unit_rule
+from gonio.integrate.cap import NO_LAYER, NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.integrate.lights import over_cap
 from gonio.source import Cap
@@ -34,8 +34,8 @@ _FROM = ((1e-5, 0), (3e-9, 1), (1e-11, 2), (0.0, 3))  # rtol at least this: star
 _PER_WIDTH, _PER_LAYER = 1.3, 2.0  # nodes per unit of the sinh maps of lobe and horizon that the first order must have
 _NO_LOBE = 1e9  # [rad]
 _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
-_TILE = 1 << 15  # nodes evaluated at once: they stay in the cache
-_WORTH = 1 << 17  # nodes below which several threads gain nothing
+_TILE = 1 << 14  # nodes evaluated at once: they stay in the cache
+_WORTH = 1 << 15  # nodes below which several threads gain nothing
 _LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
 _FEW = 64  # surface elements up to which cells are tried where no order suits
 _NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
@@ -181,7 +181,8 @@ def _scene(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) 
         local = (inside > 10.0) | (inside < least) | (elements.cos_theta < 0.2)
     symmetric = (axis[:, 1] == 0.0) & term.model.isotropic & (not term.model.own)
     cos_n = np.maximum(elements.cos_theta, _LIMB)
-    return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, term.layer_width(), planes, symmetric)
+    depth = term.layer_width() if term.model.shadowed else NO_LAYER
+    return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, depth, planes, symmetric)
 
 
 def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
@@ -206,8 +207,9 @@ def _first_orders(scene: _Scene, rtol: float) -> NDArray[np.intp]:
     start = next(k for least, k in _FROM if rtol >= least)
     if scene.width >= 10.0:
         return np.full(len(scene.cos_n), start)
-    layer = _PER_LAYER * np.arcsinh(1.0 / np.maximum(scene.cos_n, 1e-15))
-    needed = np.maximum(_PER_WIDTH * math.asinh(1.0 / scene.width), layer)
+    needed = np.full(len(scene.cos_n), _PER_WIDTH * math.asinh(1.0 / scene.width))
+    if scene.depth < NO_LAYER:
+        needed = np.maximum(needed, _PER_LAYER * np.arcsinh(1.0 / np.maximum(scene.cos_n, 1e-15)))
     return np.maximum(start, np.minimum(np.searchsorted(ORDERS, needed), len(ORDERS) - 3))
 
 

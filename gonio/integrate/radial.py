@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.integrate.frames import Elements
-from gonio.integrate.grid import Gradients
+from gonio.integrate.grid import BLOCK, Gradients
 
 Array = NDArray[np.float64]
 Profile = Callable[[Array], tuple[Array, Array]]
 
 _NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no digits are left to agree
+_STEEP = 30.0  # ratio of the values of a piece from which on it is their logarithm that is a polynomial
 _DEEPEST = 40  # halvings
 _FIRST, _GROWTH = 1.9, 4.4  # widths of a feature: the interval next to it, and how the others grow
 _RATE = 2.8  # the series of intervals graded so fall at least like this
@@ -47,7 +48,9 @@ class Table:
         Of tau, rising from 0.
     series : ndarray, shape (k, degree + 1)
     error : ndarray, shape (k,)
-        Of a value in that piece, from samples and interpolation.
+        Of a value in that piece, from samples and interpolation; of a logarithm where `logarithmic`.
+    logarithmic : ndarray of bool, shape (k,)
+        Where the series is that of ln R: the tail of a lobe.
     first : ndarray of int, shape (256,)
         Piece at the lower end of each 256th of [0, 1].
     relative : float
@@ -57,12 +60,15 @@ class Table:
     bounds: Array
     series: Array
     error: Array
+    logarithmic: NDArray[np.bool_]
     first: NDArray[np.int64]
     relative: float
 
     def add(self, gradients: Gradients, tile: tuple[int, int], value: Array, error: Array) -> float:
         """Add value and error on one tile of gradients; returns the table's largest relative error."""
-        _add(gradients.p, gradients.q, *tile, self.bounds, self.series, self.error, self.first, value, error)
+        _add(
+            gradients.p, gradients.q, *tile, self.bounds, self.series, self.error, self.logarithmic, self.first, value, error
+        )
         return self.relative
 
 
@@ -137,19 +143,24 @@ def tabulate(
     at_probes = np.polynomial.chebyshev.chebvander(_PROBES, degree)
     bounds = _breaks(max(upper, 1e-3), features)
     pending = [(a, b, 0) for a, b in itertools.pairwise(bounds)]
-    ready: list[tuple[float, float, Array, float]] = []
+    ready: list[tuple[float, float, Array, float, bool]] = []
     relative_error = top = 0.0
     while pending:
         a, b = (np.array([piece[k] for piece in pending])[:, None] for k in (0, 1))
         value, sampled = (v.reshape(len(pending), -1) for v in profile((a + 0.5 * (b - a) * (places + 1.0)).ravel()))
+        top = max(top, float(np.max(np.abs(value))))
+        absolute = max(atol, _NOTHING * top)
+        least, most = np.min(value, axis=1), np.max(value, axis=1)
+        steep = (least > 10.0 * absolute / rtol) & (most > _STEEP * least)  # samples are good to `absolute`
+        value[steep], sampled[steep] = np.log(value[steep]), sampled[steep] / value[steep]
         series = value[:, : degree + 1] @ to_series.T
         missed = np.max(np.abs(series @ at_probes.T - value[:, degree + 1 :]), axis=1)
-        worst, least = np.max(sampled, axis=1), np.min(np.abs(value), axis=1)
+        worst, size = np.max(sampled, axis=1), np.where(steep, 1.0, np.min(np.abs(value), axis=1))
         interpolation = np.maximum(2.0 * missed, 0.5 * np.sum(np.abs(series[:, -2:]), axis=1))
-        top = max(top, float(np.max(np.abs(value))))
-        allowed = np.maximum(np.maximum(rtol * least, atol) - lebesgue * worst, _NOTHING * top)
+        allowed = np.maximum(rtol * size, np.where(steep, 0.0, absolute)) - lebesgue * worst
         # where the samples themselves fall short, halving can't help
-        relative = np.max(sampled / np.maximum(np.abs(value), atol / rtol + 1e-300), axis=1)
+        scale = np.where(steep[:, None], 1.0, np.maximum(np.abs(value), absolute / rtol + 1e-300))
+        relative = np.max(sampled / scale, axis=1)
         allowed = np.where(lebesgue * relative > 0.9 * rtol, np.maximum(allowed, 2.0 * worst), allowed)
         again = []
         for k, (left, right, depth) in enumerate(pending):
@@ -158,37 +169,59 @@ def tabulate(
                 again += [(left, middle, depth + 1), (middle, right, depth + 1)]
             else:
                 rounding = 4.0 * (degree + 1) * np.finfo(float).eps * float(np.max(np.abs(value[k])))
-                error = max(interpolation[k] + lebesgue * worst[k], 0.3 * rtol * least[k])
-                ready.append((left, right, series[k], error + rounding))
-                relative_error = max(relative_error, (error + rounding) / least[k] if least[k] > 0.0 else 0.0)
+                error = max(interpolation[k] + lebesgue * worst[k], 0.3 * rtol * size[k]) + rounding
+                ready.append((left, right, series[k], error, bool(steep[k])))
+                relative_error = max(relative_error, error / size[k] if size[k] > 0.0 else 0.0)
         pending = again
     ready.sort(key=lambda piece: piece[0])
     ends = np.array([0.0] + [piece[1] for piece in ready])
     first = np.clip(np.searchsorted(ends, np.arange(_LOOKUP) / _LOOKUP, side="right") - 1, 0, len(ready) - 1)
     series, error = np.array([piece[2] for piece in ready]), np.array([piece[3] for piece in ready])
-    return Table(ends, series, error, first.astype(np.int64), relative_error)
+    logarithmic = np.array([piece[4] for piece in ready])
+    return Table(ends, series, error, logarithmic, first.astype(np.int64), relative_error)
 
 
-def _evaluate(p, q, start, stop, bounds, series, piece_error, first, value, error):  # type: ignore[no-untyped-def]
+def _evaluate(p, q, start, stop, bounds, series, piece_error, logarithmic, first, value, error):  # type: ignore[no-untyped-def]
     columns, last, degree = p.shape[1], series.shape[0] - 1, series.shape[1] - 1
-    for k in range(start, stop):
-        i = k // columns
-        x, y = p[i, k - i * columns], q[i, k - i * columns]
-        squared = x * x + y * y
-        tau = _END
-        if squared < 1e30:
-            tau = min(math.sqrt(squared) / (1.0 + math.sqrt(1.0 + squared)), _END)
-        piece = first[min(int(tau * _LOOKUP), _LOOKUP - 1)]
-        while piece < last and tau > bounds[piece + 1]:
-            piece += 1
-        a, b = bounds[piece], bounds[piece + 1]
-        t = (2.0 * tau - a - b) / (b - a)
-        t = min(max(t, -1.0), 1.0)
-        b1 = b2 = 0.0  # Clenshaw's recurrence
-        for j in range(degree, 0, -1):
-            b1, b2 = 2.0 * t * b1 - b2 + series[piece, j], b1
-        value[k] += t * b1 - b2 + series[piece, 0]
-        error[k] += piece_error[piece]
+    coefficients, at = series.ravel(), np.empty(BLOCK, dtype=np.int64)
+    rows = np.empty((4, BLOCK))
+    tau, t, total, before = rows[0], rows[1], rows[2], rows[3]
+    done = start
+    while done < stop:
+        i = done // columns
+        j = done - i * columns
+        n = min(min(columns - j, stop - done), BLOCK)
+        for k in range(n):
+            x, y = p[i, j + k], q[i, j + k]
+            tau[k] = x * x + y * y
+        for k in range(n):
+            squared = tau[k]
+            near = squared < 1e30
+            squared = squared if near else 1.0
+            some = math.sqrt(squared) / (1.0 + math.sqrt(1.0 + squared))
+            tau[k] = some if near and some < _END else _END
+        for k in range(n):
+            piece = first[min(int(tau[k] * _LOOKUP), _LOOKUP - 1)]
+            while piece < last and tau[k] > bounds[piece + 1]:
+                piece += 1
+            a, b = bounds[piece], bounds[piece + 1]
+            t[k] = min(max((2.0 * tau[k] - a - b) / (b - a), -1.0), 1.0)
+            at[k] = piece
+            total[k] = before[k] = 0.0
+        for r in range(degree, 0, -1):  # Clenshaw's recurrence
+            for k in range(n):
+                now = 2.0 * t[k] * total[k] - before[k] + coefficients[at[k] * (degree + 1) + r]
+                before[k] = total[k]
+                total[k] = now
+        for k in range(n):
+            piece = at[k]
+            read, slack = t[k] * total[k] - before[k] + series[piece, 0], piece_error[piece]
+            if logarithmic[piece]:
+                read = math.exp(read)
+                slack *= read
+            value[done + k] += read
+            error[done + k] += slack
+        done += n
 
 
 _add = jit.kernel(_evaluate)

@@ -147,3 +147,26 @@ def test_gradients_of_any_shape() -> None:
     assert np.array_equal(whole.ravel(), flat)
     assert gonio.reflectance_map(brdf, source, np.empty(0), 0.0).value.shape == (0,)
     assert gonio.reflectance_map(brdf, source, np.empty((0, 3)), 0.0).value.shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", ["hemispherical", "overcast"])
+def test_tails_of_a_lobe_keep_their_digits_in_a_table(name: str) -> None:
+    """Beyond theta_n = 45 deg Phong's lobe sinks below the sky's rim and R falls by orders of magnitude within a piece."""
+    phong = make_brdf("phong", k_s=1.0, n=50.0)
+    source = make_source(name, **{"radiance" if name == "hemispherical" else "zenith_radiance": 1.0})
+    p = np.linspace(0.0, 4.0, 200)
+    table = gonio.reflectance_map(phong, source, p, 0.0, rtol=1e-6)
+    few = gonio.reflectance_map(phong, source, p[::10], 0.0, rtol=1e-9)
+    assert np.min(few.value) < 1e-10 * np.max(few.value)
+    assert np.all(np.abs(table.value[::10] - few.value) <= table.error[::10] + few.error)
+    assert np.all(table.error <= 1e-6 * table.value * (1 + 1e-9))
+
+
+def test_single_gradients_and_grids_take_the_same_cosines() -> None:
+    """The loop that vectorises and the one for slopes of an unusual size, 0 and infinity among them, meet."""
+    brdf, beam = metal(0.3), make_source("collimated", theta=0.4, phi=1.0, irradiance=1.0)
+    slopes = np.array([0.0, 1e-300, 1e-99, 1e-101, 0.3, 1e99, 1e101, 1e150, np.inf])
+    got = gonio.reflectance_map(brdf, beam, slopes, 0.5).value
+    flat, steep = (gonio.reflectance_map(brdf, beam, s, 0.5).value for s in (0.0, 1e12))
+    assert got[:4] == pytest.approx(np.full(4, float(flat)), rel=1e-13)
+    assert got[5:] == pytest.approx(np.full(4, float(steep)), abs=1e-9)

@@ -12,6 +12,7 @@ import gonio
 from gonio.integrate import quadtree
 from gonio.integrate.grid import Gradients
 from gonio.integrate.methods import _MANY
+from gonio.integrate.plan import Method
 
 Array = NDArray[np.float64]
 make_brdf, make_source = gonio.brdf.make, gonio.source.make
@@ -38,7 +39,7 @@ def test_a_large_map_is_what_its_gradients_are_one_by_one(
     source = make_source("disk", theta=theta, phi=0.7, half_angle=half_angle, radiance=2.0)
     axis, rng = np.linspace(-3.0, 3.0, SIDE), np.random.default_rng(1)
     large = gonio.reflectance_map(brdf, source, axis[None, :], axis[:, None], rtol=rtol)
-    assert all("polynomials" in step.reason for step in large.plan)
+    assert all("polynomials" in step.reason for step in large.plan if step.method is not Method.LAMBERT)
     rows, columns = rng.integers(0, SIDE, (2, 4000))
     one = gonio.reflectance_map(brdf, source, axis[columns], axis[rows], rtol=max(1e-3 * rtol, 1e-11))
     assert not any("polynomials" in step.reason for step in one.plan)
