@@ -135,7 +135,8 @@ def add(
     worst = _kernel(term.model.function)(
         gradients.p, gradients.q, *tile, np.array(cap.axis), cap.half_angle, cap.radiance * term.weight,
         term.lobe_width() or 10.0, term.layer_width(), term.values, nodes, starts, np.array(_DEGREES), _reaches(rtol),
-        x, w, cuts, planes, kinked or term.model.pieces, term.model.shadowed, rtol, floor, value, error, left, crossed, counts,
+        x, w, cuts, planes, kinked or term.model.pieces, term.model.shadowed, rtol, floor, value, error, left, crossed,
+        counts,
     )  # fmt: skip
     rest, nodes_used = left[: counts[0]].astype(np.intp), int(counts[1])
     if counts[2]:
