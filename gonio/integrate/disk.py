@@ -390,8 +390,8 @@ def _kernel(function: Any) -> Any:
                     good = not rough and nearness[k] <= reaches[rule]
                     good = good and small(spread, low_sun, degrees[rule], bound, not shadowed)
                     faint = 0.0
-                    if not good and total <= 0.01 * floor and not rough:
-                        good, faint = True, floor
+                    if total <= 0.01 * floor:
+                        good, faint = good or not rough, floor
                     if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
                         step = abs(total - before)
                         estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
