@@ -57,6 +57,7 @@ _FLAT = 0.5  # spread below which the agreement of two rules is none by chance
 _SAFETY = 64.0  # of the bound
 _MARGIN = 1.25  # of 1 / rho, in the bound
 _NOTHING = 1e-60  # of the solid angle: the far tail of a lobe, of which no digits are asked
+_UNDERFLOW = 1e-301  # what is 0 may be as much
 _FAINT = 1e-16  # of the largest value of a map: the same
 _PROBES = 512  # gradients by which that value is known
 
@@ -267,7 +268,7 @@ def _kernel(function: Any) -> Any:
                 total += some[3, j] * zi * function(some[0, j], some[1, j], zi, -s, 0.0, c, parameters)
             counts[1] += at
             if total <= 0.01 * floor:
-                return total, floor
+                return total, floor if total > 0.0 else _UNDERFLOW
             if before >= 0.0:
                 step = abs(total - before)
                 estimate = 2.0 * step
@@ -391,7 +392,7 @@ def _kernel(function: Any) -> Any:
                     good = good and small(spread, low_sun, degrees[rule], bound, not shadowed)
                     faint = 0.0
                     if total <= 0.01 * floor:
-                        good, faint = good or not rough, floor
+                        good, faint = good or not rough, floor if total > 0.0 else _UNDERFLOW
                     if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
                         step = abs(total - before)
                         estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
