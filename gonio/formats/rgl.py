@@ -68,7 +68,7 @@ def write(path: Path, material: Material, attributes: Mapping[str, str] | None =
     theta_i = incidences(48)
     phi_i = np.zeros(1)
     if not material.isotropic:
-        theta_i, phi_i = theta_i[::2], np.linspace(-np.pi, np.pi, 33)
+        n, theta_i, phi_i = min(n, 64), theta_i[::2], np.linspace(-np.pi, np.pi, 25)  # as many as `read` takes
     theta_h, phi_h = half_vectors(n)
     m = unit_vector(theta_h[None, :], phi_h[:, None])  # (n phi, n theta, 3)
     copies = 3 if channels.kind == "single" else 1
