@@ -15,14 +15,12 @@ from tests.benchmarks import accuracy, band, kernels, models, page, rig, size, s
 SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig")
 INTRODUCTION = """# Benchmarks
 
-What a reflectance map costs, beside what it costs a user who picks something else. All figures of this page are from one
-run of
+What a reflectance map costs, beside what it costs a user who picks something else.
 
-    make bench          # .venv/bin/python -m tests.benchmarks; one section: .venv/bin/python -m tests.benchmarks size
+    make bench                                              # all sections, more than an hour
+    .venv/bin/python -m tests.benchmarks targets --write    # one of them, written into this page
 
-Nothing here is a test: times depend on the machine and on what else it does.
-
-{machine}
+Nothing here is a test: times depend on the machine and on what else it does. Each section says when it was run.
 """
 ACCURACY = """
 Wall time per map of 64 x 64 gradients in [-3, 3] and, after the dot, evaluations of f_r per gradient, for the *true* error
@@ -49,6 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("section", nargs="*", choices=[*SECTIONS, []], help="all by default")
     parser.add_argument("--quick", action="store_true", help="a few scenes, a minute on an idle machine; writes no page")
+    parser.add_argument("--write", action="store_true", help="put the sections that are run into the page in docs")
     parser.add_argument("--scene", default="", help="accuracy: only scenes whose name contains this")
     given = parser.parse_args()
     chosen = given.section or SECTIONS
@@ -58,45 +57,43 @@ def main() -> None:
     speeds = kernels.measure()
     text: dict[str, str] = {}
 
-    def tell(section: str, title: str, body: str) -> None:
-        text[section] = f"\n## {title}\n\n{body}"
+    def tell(section: str, body: str) -> None:
+        text[section] = f"\n## {page.TITLES[section]}\n\n*{machine}*\n\n{body}"
         print(f"{text[section]}\n({time.perf_counter() - began:.0f} s so far)", flush=True)
 
-    print(machine)
-    tell("kernels", "One evaluation", page.kernels(speeds))
+    tell("kernels", page.kernels(speeds))
     if "models" in chosen:
-        tell("models", "Every model", models.report(models.measure(), models.compile_cold()))
+        tell("models", models.report(models.measure(), models.compile_cold()))
     found, results, costs, started = [], [], {}, None
     if "targets" in chosen:
         found = list(targets.measure(quick=given.quick))
-        tell("targets", "Maps that gonio promises", page.times(found, speeds.factor))
+        tell("targets", page.times(found, speeds.factor))
     if "accuracy" in chosen:
         for result in accuracy.measure(quick=given.quick, chosen=given.scene):
             results.append(result)
             print(f"\n{page.one_result(result)}({time.perf_counter() - began:.0f} s so far)", flush=True)
         body = f"![time against error]({page.PICTURE})\n{ACCURACY}\n{page.summary(results)}"
-        tell("accuracy", "Run time against error", body)
+        tell("accuracy", body)
         text["accuracy"] += "\n### Scene by scene\n\n" + "\n".join(
             page.one_result(r) for r in results if r.scene in accuracy.SHOWN
         )
     if "size" in chosen:
         costs = {scene: size.measure(scene, quick=given.quick) for scene in size.SCENES}
-        tell("size", "Size of the map", page.sizes(costs))
+        tell("size", page.sizes(costs))
     if "start" in chosen:
         started = start.measure(quick=given.quick)
-        tell("start", "Start", page.start(started))
+        tell("start", page.start(started))
     if "band" in chosen:
-        tell("band", "Band of a posterior", page.bands([band.measure(l, quick=given.quick) for l in band.LIGHTS]))
+        tell("band", page.bands([band.measure(l, quick=given.quick) for l in band.LIGHTS]))
     if "rig" in chosen:
-        tell("rig", "Simulated rig", rig.report(rig.measure(quick=given.quick)))
+        tell("rig", rig.report(rig.measure(quick=given.quick)))
     if started is not None and found and results:
-        tell("verdicts", "Promises", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
+        tell("verdicts", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
     if whole:
         page.picture(results, page.DOCS / page.PICTURE)
-        order = ("verdicts", "accuracy", "targets", "size", "kernels", "models", "start", "band", "rig")
-        body = INTRODUCTION.format(machine=machine) + "".join(text[s] for s in order)
-        (page.DOCS / "benchmarks.md").write_text(body, encoding="utf-8")
-        print(f"\nwrote {page.DOCS / 'benchmarks.md'} and its picture")
+    if (whole or given.write) and not given.quick:
+        page.write_sections(INTRODUCTION, text)
+        print(f"\nwrote {', '.join(text)} into {page.DOCS / 'benchmarks.md'}")
 
 
 if __name__ == "__main__":

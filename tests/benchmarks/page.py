@@ -7,7 +7,8 @@ import importlib.util
 import math
 import os
 import platform
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,6 +22,11 @@ from tests.benchmarks.targets import TARGETS, Time
 
 DOCS = Path(__file__).parents[2] / "docs"
 PICTURE = "images/benchmark.png"
+TITLES = {
+    "verdicts": "Promises", "accuracy": "Run time against error", "targets": "Maps that gonio promises",
+    "size": "Size of the map", "kernels": "One evaluation", "models": "Every model", "start": "Start",
+    "band": "Band of a posterior", "rig": "Simulated rig",
+}  # fmt: skip
 Row = Sequence[str]
 
 
@@ -58,6 +64,15 @@ def machine() -> str:
     load = f"; load average at the start {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     return f"{name}, {CORES} cores, Python {platform.python_version()}, {packages}, {today}{load}."
+
+
+def write_sections(introduction: str, fresh: Mapping[str, str]) -> None:
+    """Put sections into the page: their texts by name, each beginning with its title; the others stay as they are."""
+    path = DOCS / "benchmarks.md"
+    older = re.split(r"\n(?=## )", path.read_text(encoding="utf-8"))[1:] if path.exists() else []
+    texts = {text.split("\n", 1)[0]: f"\n{text.rstrip()}\n" for text in older}
+    texts |= {f"## {TITLES[name]}": text for name, text in fresh.items()}
+    path.write_text(introduction + "".join(texts.get(f"## {title}", "") for title in TITLES.values()), encoding="utf-8")
 
 
 def cell(run: Run | None) -> str:
