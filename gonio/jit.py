@@ -75,8 +75,7 @@ def kernel(function: Callable[..., Any], *, apart: bool = False, **options: Any)
         If the function uses an object whose content cannot be fingerprinted.
     """
     options = {"error_model": "numpy", "fastmath": FAST, "nogil": True} | options
-    shown = sorted((name, sorted(value) if isinstance(value, set) else value) for name, value in options.items())
-    text = repr([_FORMAT, numba.__version__, shown, apart, _fingerprint(function, set())])
+    text = repr([_FORMAT, numba.__version__, _shown(options), apart, _fingerprint(function, set())])
     key = hashlib.sha256(text.encode()).hexdigest()
     function = _named(function, key)
     compiled = numba.njit(**_BARE, **options)(function)
@@ -114,11 +113,15 @@ def _named(function: Callable[..., Any], key: str) -> Callable[..., Any]:
     return copy
 
 
+def _shown(options: dict[str, Any]) -> list[tuple[str, str]]:
+    """Options of numba as a text; the order of a set is another in each process."""
+    return sorted((name, str(sorted(v) if isinstance(v, set | frozenset) else v)) for name, v in options.items())
+
+
 def _fingerprint(value: Any, seen: set[Any]) -> Any:
     """What machine code made from `value` depends on: loaded code, constants and, recursively, the functions called."""
     if isinstance(value, Dispatcher):
-        options = sorted((name, str(option)) for name, option in value.targetoptions.items())
-        return ["jit", options, _fingerprint(value.py_func, seen)]
+        return ["jit", _shown(value.targetoptions), _fingerprint(value.py_func, seen)]
     if isinstance(value, types.CodeType):
         constants = [_fingerprint(constant, seen) for constant in value.co_consts]
         return [value.co_code, value.co_names, value.co_varnames, value.co_freevars, constants]
@@ -136,8 +139,10 @@ def _fingerprint(value: Any, seen: set[Any]) -> Any:
         ]
     if isinstance(value, np.ndarray):
         return [value.dtype.str, value.shape, value.tobytes()]
-    if isinstance(value, tuple | frozenset):
-        return [type(value).__name__, [_fingerprint(item, seen) for item in value]]
+    if isinstance(value, tuple):
+        return ["tuple", [_fingerprint(item, seen) for item in value]]
+    if isinstance(value, frozenset):  # whose order is another in each process
+        return ["frozenset", sorted(repr(_fingerprint(item, seen)) for item in value)]
     if isinstance(value, bool | int | float | complex | str | bytes | types.NoneType):
         return value
     if str(getattr(value, "__module__", getattr(value, "__name__", ""))).split(".")[0] in _PURE:

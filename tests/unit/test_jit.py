@@ -54,6 +54,28 @@ def test_cache_hits_and_is_never_stale(tmp_path: Path) -> None:
     assert _run(tmp_path, 2.0, 0.0, cache) == (12.0, 1)  # compiles again, does not fail
 
 
+_KEYS = """
+from gonio.brdf import families
+from gonio.integrate import cut_disk, disk, ring_kernel
+functions = [m.function for m in (f.model() for f in families.FAMILIES.values()) if m.function is not None]
+for build in (disk._kernel, cut_disk._kernel, ring_kernel.ring_kernel):
+    print(*(build(f).py_func.__qualname__ for f in functions))
+"""
+
+
+def test_keys_are_the_same_in_every_process() -> None:
+    """Python orders sets of strings anew in each process; a key that hung on it would compile now and then for ever."""
+    environment = os.environ | {"PYTHONPATH": str(Path(jit.__file__).parents[1])}
+    keys = {
+        subprocess.run(
+            [sys.executable, "-c", _KEYS], env=environment | {"PYTHONHASHSEED": s}, capture_output=True, text=True,
+            check=True,
+        ).stdout  # fmt: skip
+        for s in ("1", "2", "3")
+    }
+    assert len(keys) == 1 and len(keys.pop().split()) > 50
+
+
 def test_objects_that_cannot_be_fingerprinted_are_refused() -> None:
     settings = {"gain": 2.0}
 
