@@ -70,7 +70,7 @@ def test_keys_are_the_same_in_every_process() -> None:
         subprocess.run(
             [sys.executable, "-c", _KEYS], env=environment | {"PYTHONHASHSEED": s}, capture_output=True, text=True,
             check=True,
-        ).stdout  # fmt: skip
+        ).stdout
         for s in ("1", "2", "3")
     }
     assert len(keys) == 1 and len(keys.pop().split()) > 50
