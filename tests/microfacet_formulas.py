@@ -73,9 +73,26 @@ def smith_lambda(theta: mpf, distribution: str, alpha: mpf, gamma: mpf | None, d
     if distribution == "std":  # (1/cot) int_cot^inf (q - cot) P_1(q) dq with P_1 of Ribardiere et al.
         x = nu / sqrt(gamma - 1)
         norm = mpmath.gamma(gamma - mpf(1) / 2) / (sqrt(pi) * mpmath.gamma(gamma - 1))
-        tail = mpmath.betainc(gamma - 1, mpf(1) / 2, 0, 1 / (1 + x * x), regularized=True) / 2
+        tail = std_tail(x, gamma - 1) / 2
         return norm * (1 + x * x) ** (mpf(3) / 2 - gamma) / ((2 * gamma - 3) * x) - tail
     return gtr_lambda(y, alpha, gamma)
+
+
+def std_tail(x: mpf, a: mpf) -> mpf:
+    """The regularised incomplete beta function I_c(a, 1/2), c = 1 / (1 + x^2).
+
+    mpmath's series for it don't converge for large a near c = 1. There 2 / B(1/2, a) int_x^inf (1 + t^2)^-(a + 1/2) dt is
+    integrated over u = (a + 1/2) ln((1 + t^2) / (1 + x^2)), of which the integrand is about exp(-u) / sqrt(u + u_0).
+    """
+    if a < 1000:
+        return mpmath.betainc(a, mpf(1) / 2, 0, 1 / (1 + x * x), regularized=True)
+    b, ln = a + mpf(1) / 2, mpmath.log1p(x * x)
+
+    def density(u: mpf) -> mpf:
+        return exp(u / b - u) / sqrt(mpmath.expm1(u / b + ln))
+
+    steps = sorted({mpf(0), min(b * ln, mpf(1)), mpf(1), mpf(20), mpf(3 * mpmath.mp.dps)})
+    return exp(ln - b * ln) / (b * mpmath.beta(mpf(1) / 2, a)) * mpmath.quad(density, steps)
 
 
 def gtr_lambda(y: mpf, alpha: mpf, gamma: mpf) -> mpf:
