@@ -7,8 +7,9 @@ from pathlib import Path
 import click
 
 from gonio.cli import steps
+from gonio.cli.fit_choices import chosen_fit, fit_choices
 from gonio.cli.output import json_option, speaking
-from gonio.errors import ConfigurationError, ConvergenceError
+from gonio.errors import ConvergenceError
 
 RUN = click.argument("run", type=click.Path(path_type=Path))
 
@@ -36,10 +37,7 @@ def table(run: Path, fill: bool, as_json: bool) -> None:
 
 @click.command()
 @RUN
-@click.option("--model", help="Sum of models, such as lambertian+ggx.")
-@click.option("--config", type=click.Path(path_type=Path, dir_okay=False), help="A fit.toml.")
-@click.option("--free", multiple=True, metavar="NAME", help="Free a parameter that its model holds, e.g. ggx.k_s.")
-@click.option("--fix", multiple=True, metavar="NAME=VALUE", help="Hold a parameter.")
+@fit_choices
 @click.option("--seed", type=int, help="Of the sampler; 1 by default.")
 @json_option
 def fit(
@@ -52,28 +50,8 @@ def fit(
     as_json: bool,
 ) -> None:
     """Fit a model to the samples of RUN with MCMC (posterior.nc); exit code 5 if the chains did not converge."""
-    from gonio.config import load_fit
-
-    chosen = load_fit(config) if config is not None else None
-    model = model or (chosen.model if chosen else None)
-    if model is None:
-        raise ConfigurationError("no model: give --model lambertian+ggx or --config fit.toml")
-    held = dict(chosen.fix) if chosen else {}
-    for item in fix:
-        name, separator, value = item.partition("=")
-        try:
-            held[name] = float(value)
-        except ValueError:
-            separator = ""
-        if not separator:
-            raise ConfigurationError(f"--fix {item}: write it as --fix NAME=VALUE, for example --fix ggx.f_0=0.04")
-    options: dict[str, object] = {"free": tuple(free) + (chosen.free if chosen else ()), "fix": held}
-    if chosen and chosen.priors:
-        options["priors"] = dict(chosen.priors)
-    if chosen and chosen.max_steps:
-        options["max_steps"] = chosen.max_steps
-    if seed is None:
-        seed = chosen.seed if chosen else 1
+    model, given_seed, options = chosen_fit(model, config, free, fix)
+    seed = given_seed if seed is None else seed
     with speaking(as_json) as output, steps.open_run(run) as opened:
         posterior = steps.fit(opened, output, model, seed, **options)
         steps.show_fit(output, posterior)

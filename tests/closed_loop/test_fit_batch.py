@@ -1,0 +1,117 @@
+"""gonio fit-batch from a Zarr cube to a Zarr folder: interrupted, damaged, on a cluster whose worker dies."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from gonio.cli.main import main
+from tests.unit.test_fitting_batch import JOB, plastics
+
+zarr = pytest.importorskip("zarr")
+SHAPE = (12, 5)
+
+
+def cube(path, shape=SHAPE, seed=21):
+    """A cube of plastics; returns the truth (p, 3)."""
+    s = JOB.samples
+    truth, readings, u = plastics(seed, int(np.prod(shape)), s)
+    group = zarr.create_group(path)
+    arrays = {"brdf": readings.T.reshape(len(s), *shape), "brdf_standard_error": u.T.reshape(len(s), *shape)}
+    arrays |= {name: getattr(s, name) for name in ("theta_i", "phi_i", "theta_r", "phi_r")}
+    for name, array in arrays.items():
+        group.create_array(name, shape=array.shape, dtype=array.dtype)[...] = array
+    return truth
+
+
+def fit(data, out, *more):
+    given = [str(data), "--model", "lambertian+ggx", "--out", str(out), "--tile", "5", *more]
+    return main(["fit-batch", *given])
+
+
+def content(path):
+    return {name: np.asarray(array[...]).tobytes() for name, array in zarr.open_group(path, mode="r").arrays()}
+
+
+def test_a_cube_is_fitted_and_a_begun_one_gone_on_with(tmp_path, capsys):
+    truth = cube(tmp_path / "cube.zarr")
+    out = tmp_path / "fits.zarr"
+    assert fit(tmp_path / "cube.zarr", out, "--processes", "1") == 0
+    whole = content(out)
+    group = zarr.open_group(out, mode="r")
+    assert group.attrs["parameters"] == ["lambertian.albedo", "ggx.alpha", "ggx.f_0"]
+    mean, sd = (np.asarray(group[name][...]).reshape(-1, 3) for name in ("mean", "sd"))
+    good = np.asarray(group["status"][...]).ravel() == 0
+    assert good.sum() >= 58
+    assert np.max(np.abs(mean - truth)[good] / sd[good]) < 5.0
+
+    # as after a crash: one tile never written, one written by half
+    again = zarr.open_group(out, mode="r+")
+    again["done"][3] = [-1, -1]
+    again["mean"][7, 2] = 0.5
+    capsys.readouterr()
+    assert fit(tmp_path / "cube.zarr", out, "--processes", "1") == 0
+    assert "10 of 12 tiles were there already" in capsys.readouterr().out
+    assert content(out) == whole
+
+
+def test_other_options_and_other_folders_are_not_mixed_up(tmp_path, capsys):
+    cube(tmp_path / "cube.zarr", (1, 2))
+    out = tmp_path / "fits.zarr"
+    assert fit(tmp_path / "cube.zarr", out) == 0
+    assert fit(tmp_path / "cube.zarr", out, "--fix", "ggx.f_0=0.04") == 2
+    assert "holds another fit (job differs)" in capsys.readouterr().err
+    assert fit(tmp_path / "cube.zarr", tmp_path) == 2
+    assert "exists and holds no fit" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "cube.zarr" / "theta_r")
+    assert fit(tmp_path / "cube.zarr", tmp_path / "other.zarr") == 6
+    assert "there is no theta_r" in capsys.readouterr().err
+
+
+def test_channels_of_a_file_are_pixels(tmp_path):
+    """Three channels of noise-free paper in CSV, uncertainty unknown."""
+    theta = np.linspace(0.0, 70.0, 20)
+    rows = "\n".join(f"{t:.3f},0,30,180,{0.1 / np.pi},{0.4 / np.pi},{0.8 / np.pi}" for t in theta)
+    data = tmp_path / "paper.csv"
+    data.write_text(f"theta_i_deg,phi_i_deg,theta_r_deg,phi_r_deg,f_r_red,f_r_green,f_r_blue\n{rows}\n", encoding="utf-8")
+    out = tmp_path / "fits.zarr"
+    assert main(["fit-batch", str(data), "--model", "lambertian", "--quantity", "brdf", "--out", str(out)]) == 0
+    mean = np.asarray(zarr.open_group(out, mode="r")["mean"][...])
+    assert mean[:, 0] == pytest.approx([0.1, 0.4, 0.8], rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore")  # of Dask, about a worker that died
+def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    cube(tmp_path / "cube.zarr")
+    assert fit(tmp_path / "cube.zarr", tmp_path / "here.zarr", "--processes", "1") == 0
+
+    from gonio.cli import cubes
+
+    written, killed = cubes.ZarrSink.write, []
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=60) as cluster:
+
+        def write(self, start, stop, estimates):
+            if not killed:
+                killed.append(cluster.workers[0].process.pid)
+                os.kill(killed[0], signal.SIGKILL)
+            written(self, start, stop, estimates)
+
+        monkeypatch.setattr(cubes.ZarrSink, "write", write)
+        assert fit(tmp_path / "cube.zarr", tmp_path / "there.zarr", "--scheduler", cluster.scheduler_address) == 0
+    assert killed
+    assert content(tmp_path / "here.zarr") == content(tmp_path / "there.zarr")
+
+
+def test_no_scheduler_is_one_sentence(tmp_path, capsys):
+    pytest.importorskip("distributed")
+    cube(tmp_path / "cube.zarr", (1, 2))
+    began = time.monotonic()
+    assert fit(tmp_path / "cube.zarr", tmp_path / "out.zarr", "--scheduler", "tcp://127.0.0.1:9") == 3
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+    assert time.monotonic() - began < 60
