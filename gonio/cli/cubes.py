@@ -101,7 +101,7 @@ class CubeSource:
         if brdf.ndim < 2:
             raise DatasetError(f"{self.path}: brdf has {brdf.ndim} axis; it needs sample and one or more of pixels")
         n = brdf.shape[0]
-        angles = [np.asarray(self._array(name)[...], dtype=float) for name in _ANGLES]
+        theta_i, phi_i, theta_r, phi_r = (np.asarray(self._array(name)[...], dtype=float) for name in _ANGLES)
         group = _opened(self.path)
         u = np.full(n, np.nan)
         if "brdf_standard_error" in group:
@@ -113,7 +113,7 @@ class CubeSource:
         rows = max(1, 1024 // max(1, int(np.prod(brdf.shape[2:]))))
         first = np.nan_to_num(_median(self.read(0, rows)[0]))
         shared = _shared(group.attrs.get("shared_errors", []), self.path)
-        plain = BRDFSamples.plain(*angles, first, u)
+        plain = BRDFSamples.plain(theta_i, phi_i, theta_r, phi_r, first, u)
         if not shared:
             return plain
         d_omega_i, d_omega_r, d_ln_f = (np.asarray(self._array(name)[...], dtype=float) for name in _DIRECTIONS)
