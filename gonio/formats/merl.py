@@ -5,9 +5,11 @@ Little-endian ``int32`` 90, 90, 180, then the planes red, green, blue of float64
 other half is reciprocal. f_r [1/sr] = stored value times 1/1500, 1.15/1500, 1.66/1500. A negative value marks a direction
 pair below the horizon or one never measured.
 
-Written is the value at the lower edge of each bin: readers that interpolate take the edges for nodes, and readers that
-truncate are exact there. A bin whose edge is below the horizon, though part of it is above, holds the value at its centre
-or at its highest corner. A single channel is written three times.
+The database's own code, and most readers after it, give every direction pair of a bin the bin's one value. So what is
+written is the bin's mean, weighted with cos(theta_i) cos(theta_r) d omega_i d omega_r as far as it is above the horizon:
+then such a reader reflects the right energy. (Values at the edges of bins would make a metal of alpha = 0.1 reflect 7 % too
+much.) A program that takes the lower edges for nodes and interpolates sees the lobe shifted by half a bin; docs/formats.md
+has the figures. Read are values at the centres of bins. A single channel is written three times.
 
 References
 ----------
@@ -18,6 +20,7 @@ References
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +39,7 @@ CELLS = 90 * 90 * 180
 SCALE = (1.0 / 1500.0, 1.15 / 1500.0, 1.66 / 1500.0)
 HEADER = np.array(SHAPE, dtype="<i4").tobytes()
 SIZE = 12 + 3 * CELLS * 8
+LOWEST = 0.035  # cosine, of 88 degrees, below which a bin is not read
 DRAWS = 30_000  # bins looked at when a file is thinned to samples
 
 
@@ -45,20 +49,23 @@ def sniff(head: bytes) -> bool:
 
 
 def read(path: Path) -> ChannelSamples:
-    """About 20 000 RGB samples at lower bin edges, spread evenly over the table's coordinates by an R3 sequence [2]_.
+    """About 20 000 RGB samples at the centres of bins, spread evenly over the table's coordinates by an R3 sequence [2]_.
 
     Scattered bins rather than every n-th: a fit or a table learns more from them, and leave-one-out errors mean something.
     Without uncertainty (NaN), which the format cannot hold.
     """
     planes = read_planes(path)
-    theta_h, theta_d, phi_d = edges()
     take = _scattered()
-    h, d, p = theta_h[take[0]], theta_d[take[1]], phi_d[take[2]]  # (n,)
     stored = np.stack([plane[tuple(take)] for plane in planes], axis=-1)
     value = np.where(stored >= 0, stored * np.array(SCALE), np.nan)
+    theta_h, theta_d, phi_d = edges()
+    low = theta_h[take[0]], theta_d[take[1]], phi_d[take[2]]  # (n,) each
+    high = theta_h[take[0] + 1], theta_d[take[1] + 1], phi_d[take[2] + 1]
+    h, d, p = (0.5 * (a + b) for a, b in zip(low, high, strict=True))
     omega_i, omega_r = directions(h, np.zeros_like(h), d, p)
-    # bins whose edge lies below the horizon hold the value of another point of the bin
-    above = (omega_i[..., 2] > 1e-3) & (omega_r[..., 2] > 1e-3)
+    # the corner nearest the horizon: where f_r cos cos bends within a bin, its mean is not the value at its centre
+    corner = directions(high[0], np.zeros_like(h), high[1], np.where(p < np.pi / 2, low[2], high[2]))
+    above = (corner[0][..., 2] > LOWEST) & (corner[1][..., 2] > LOWEST)
     valid = np.all(stored >= 0, axis=-1)
     keep = above & np.any(stored >= 0, axis=-1)
     if not np.any(keep):
@@ -70,7 +77,7 @@ def read(path: Path) -> ChannelSamples:
         "source_quantity": "brdf, linear RGB",
         "source_format": "merl",
         "n_missing": str(int(np.count_nonzero(above & ~valid))),
-        "thinning": f"{np.count_nonzero(keep)} of {CELLS} bins, scattered evenly, at their lower edges",
+        "thinning": f"{np.count_nonzero(keep)} of {CELLS} bins, scattered evenly, at their centres",
     }
     return ChannelSamples.make(theta_i, phi_i, theta_r, phi_r, value[keep], RGB, attributes=attributes)
 
@@ -94,9 +101,9 @@ def read_planes(path: Path) -> Array:
 
 
 def edges() -> tuple[Array, Array, Array]:
-    """Lower bin edges of theta_h, theta_d and phi_d [rad]."""
-    k = np.arange(90.0)
-    return np.radians(k * k / 90.0), np.radians(k), np.radians(np.arange(180.0))
+    """Bin edges of theta_h (91,), theta_d (91,) and phi_d (181,) [rad]."""
+    k = np.arange(91.0)
+    return np.radians(k * k / 90.0), np.radians(k), np.radians(np.arange(181.0))
 
 
 def write(path: Path, material: Material) -> None:
@@ -113,7 +120,7 @@ def write(path: Path, material: Material) -> None:
         raise DatasetError(f"{path}: a MERL file holds linear RGB, these data are X, Y, Z; export one channel")
     if material.channels.kind != "rgb":
         material = material.one()
-    planes = [sampled(brdf) for brdf in material.brdfs]
+    planes = [bin_means(brdf) for brdf in material.brdfs]
     if not all(np.all(np.isfinite(plane)) for plane in planes):
         raise DatasetError(f"{path}: the BRDF is not finite everywhere, so no MERL file can be made from it")
     pairs = zip(planes * (3 // len(planes)), SCALE, strict=True)
@@ -125,27 +132,40 @@ def write(path: Path, material: Material) -> None:
     files.replace_atomically(path, put)
 
 
-def sampled(brdf: BRDF) -> Array:
-    """f_r [1/sr] for each bin, shape (90, 90, 180); -1 where a whole bin is below the horizon."""
+def bin_means(brdf: BRDF) -> Array:
+    """Mean f_r [1/sr] of each bin, shape (90, 90, 180); -1 where a whole bin is below the horizon.
+
+    Gauss's rule of two points along each angle. A bin whose points are all below the horizon, though a corner of it is
+    above, holds the value at its highest corner.
+    """
     theta_h, theta_d, phi_d = edges()
-    out = np.full(SHAPE, -1.0)
-    step_h = np.radians((2.0 * np.arange(90.0) + 1.0) / 90.0)  # bin widths of theta_h: ((k+1)^2 - k^2)/90 degrees
+    inside = np.array([0.5 - math.sqrt(1 / 12), 0.5 + math.sqrt(1 / 12)])
     one = np.radians(1.0)
-    # the edge itself, then the centre, then the corner of the bin that stands highest above the horizon
-    lower = np.where(phi_d < np.pi / 2, one * (1 - 1e-9), 0.0)  # towards phi_d = 90 degrees both directions rise
-    places = ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.0, 0.0, -1.0))
-    for up_h, up_d, up_p in places:
-        for row in range(SHAPE[0]):
-            open_ = out[row] < 0
-            if not np.any(open_):
-                continue
-            d, p = np.nonzero(open_)
-            shift = lower[p] if up_p < 0 else up_p * one
-            h_angle = np.full(d.shape, theta_h[row] + up_h * step_h[row])
-            wi, wr = directions(h_angle, 0.0, theta_d[d] + up_d * one, phi_d[p] + shift)
-            above = (wi[:, 2] > 1e-12) & (wr[:, 2] > 1e-12)
-            if np.any(above):
-                out[row][d[above], p[above]] = brdf.evaluate(wi[above], wr[above])
+    d = (theta_d[:90, None] + one * inside).reshape(-1, 1)
+    p = (phi_d[:180, None] + one * inside).reshape(-1)
+    along, across, up = np.sin(d) * np.cos(p), np.sin(d) * np.sin(p), np.cos(d) + 0.0 * p  # the difference vector (180, 360)
+    out = np.full(SHAPE, -1.0)
+    for row in range(SHAPE[0]):
+        h = (theta_h[row] + (theta_h[row + 1] - theta_h[row]) * inside)[:, None, None]
+        c, s = np.cos(h), np.sin(h)
+        cos_i, cos_r = c * up - s * along, c * up + s * along  # (2, 180, 360)
+        above = (cos_i > 0) & (cos_r > 0)
+        # d omega_i d omega_r = 4 cos(theta_d) d omega_h d omega_d
+        weight = np.where(above, s * np.sin(d) * up * cos_i * cos_r, 0.0)
+        wi = np.stack((c * along + s * up, across + 0.0 * h, cos_i), axis=-1)[above]
+        wr = np.stack((s * up - c * along, 0.0 * h - across, cos_r), axis=-1)[above]
+        energy = np.zeros_like(weight)
+        energy[above] = weight[above] * brdf.evaluate(wi, wr)
+        total, sums = (x.reshape(2, 90, 2, 180, 2).sum(axis=(0, 2, 4)) for x in (weight, energy))
+        known = total > 0
+        out[row][known] = sums[known] / total[known]
+        k, j = np.nonzero(~known)
+        # towards phi_d = 90 degrees both directions rise
+        highest = np.where(phi_d[j] < np.pi / 2, phi_d[j] + one * (1 - 1e-9), phi_d[j])
+        wi, wr = directions(np.full(k.shape, theta_h[row]), 0.0, theta_d[k], highest)
+        corner = (wi[:, 2] > 1e-12) & (wr[:, 2] > 1e-12)
+        if np.any(corner):
+            out[row][k[corner], j[corner]] = brdf.evaluate(wi[corner], wr[corner])
     return out
 
 

@@ -217,12 +217,12 @@ def grid_of(material: Material) -> Grid:
     theta_h[-1] = 90.0
     fold = material.isotropic and material.reciprocal
     # finer towards grazing, where Fresnel and shadowing bend
-    theta_d = np.degrees(np.arccos(np.linspace(1.0, 0.0, 61)))
-    theta_d = np.unique(np.concatenate((np.arange(0.0, 60.0, 2.0), theta_d[theta_d >= 60.0])))
+    theta_d = np.degrees(np.arccos(np.linspace(1.0, 0.0, 91)))
+    theta_d = np.unique(np.concatenate((np.linspace(0.0, 60.0, 46)[:-1], theta_d[theta_d >= 60.0 - 1e-9])))
     phi_d = np.linspace(0.0, 90.0, 31) if fold else np.linspace(0.0, 360.0, 37)
     phi_h = np.zeros(1) if material.isotropic else np.linspace(0.0, 360.0, 37)
     if not material.isotropic:
-        theta_h, theta_d = theta_h[::2], theta_d[::2]
+        theta_h, theta_d = theta_h[::2], theta_d[::3]
         theta_h[-1], theta_d[-1] = 90.0, 90.0
     reductions = ("bilateral_symmetry", "reciprocity") if fold else ()
     empty = np.zeros((1, 1, 1, 1, 1))

@@ -34,7 +34,7 @@ def told(found: list[Figure]) -> None:
 
 @needs("mitsuba")
 def test_mitsuba_reads_rgl(tmp_path: Path) -> None:
-    told(format_figures.rgl_figures(tmp_path, "paint", materials.single(0.3), 5e-3, n=1500))
+    told(format_figures.rgl_figures(tmp_path, "paint", materials.single(0.3), n=1500))
 
 
 @needs("mitsuba")
@@ -130,7 +130,7 @@ def test_grid_formats_between_their_nodes(tmp_path: Path) -> None:
     formats.export("ssdd", tmp_path / "a.ssdd", material=materials.single(0.3))
     read = format_figures.ssdd_reader(tmp_path / "a.ssdd")
     told(format_figures.compare("ssdd", "linear", "paint", read, materials.single(0.3), 5e-3, 2000, 1))
-    told(format_figures.netcdf_figures(tmp_path, "paint", materials.paint(0.3, 0.3), 5e-3, 2000))
+    told(format_figures.netcdf_figures(tmp_path, "paint", materials.paint(0.3, 0.3), 2000))
 
 
 @needs("jsonschema")
