@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError, ParameterError
+from gonio.integrate import threads
 from gonio.integrate.cells import COLUMNS, GAUSS, KRONROD, MOST_PLANES, NODES, build, fill, place
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ Index = NDArray[np.intp]
 Radiance = Callable[[Array, Index], Array]
 EPS = float(np.finfo(float).eps)
 _BLOCK = 64  # elements that advance together
-_CHUNK = 1024  # cells evaluated at once: 30 MiB
+_CHUNK = 128  # cells evaluated at once: 2 MiB
 _LARGEST = 1 << 24  # nodes for one element
 _SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of the rules
 _GROWTH = 8.0  # of panels away from the horizon
@@ -70,7 +71,7 @@ class Light(NamedTuple):
     Attributes
     ----------
     radiance : callable
-        ``(directions (m, 3) in the local frames, element (m,)) -> (m,)``.
+        ``(directions (m, k, 3) in the local frames, element (m,)) -> (m, k)``.
     peaks : ndarray, shape (n, f, 3)
         Directions in the local frames around which it is concentrated.
     widths : ndarray, shape (f,)
@@ -100,9 +101,10 @@ def integrate(
     light: Light | None,
     *,
     rtol: float,
-    atol: float,
+    atol: float | Array,
     effort: Counter,
     reverse: bool = False,
+    cores: int = 1,
 ) -> tuple[Array, Array]:
     r"""Integral of f_r L cos theta over the directions of a region, for each of n elements.
 
@@ -115,11 +117,14 @@ def integrate(
     region : Region
     light : Light, optional
         None for a radiance of 1.
-    rtol, atol : float
+    rtol : float
+    atol : float or ndarray, shape (n,)
         Tolerance per element. An element that does not reach it keeps its honest error.
     effort : Counter
     reverse : bool, optional
         `fixed` is omega_i, and omega_r is integrated over.
+    cores : int, optional
+        More than one only where `light` is compiled code or NumPy's.
 
     Returns
     -------
@@ -134,16 +139,21 @@ def integrate(
     """
     n = len(fixed)
     value, error = np.zeros(n), np.zeros(n)
+    absolute = np.broadcast_to(np.asarray(atol, dtype=float), n)
     size = _BLOCK if light is None or light.planes is None else max(1, _BLOCK // (1 + light.planes.shape[1]))
-    for start in range(0, n, size):
-        part = slice(start, min(n, start + size))
-        lit = np.arange(n)[part]
+
+    def work(start: int) -> int:
+        lit = np.arange(start, min(n, start + size))
         if region.half_angle < math.pi / 2:
-            lit = lit[region.axis[part, 2] > -math.sin(region.half_angle)]  # others lie below the horizon as a whole
-        if len(lit):
-            here = None if light is None else light.select(lit)
-            block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), here, lit, reverse, effort)
-            value[lit], error[lit] = block.run(rtol, atol)
+            lit = lit[region.axis[lit, 2] > -math.sin(region.half_angle)]  # others lie below the horizon as a whole
+        if not len(lit):
+            return 0
+        here = None if light is None else light.select(lit)
+        block = _Block(term, fixed[lit], region._replace(axis=region.axis[lit]), here, lit, reverse)
+        value[lit], error[lit] = block.run(rtol, absolute[lit])
+        return block.nodes
+
+    effort.add(sum(threads.run(work, range(0, n, size), cores)), NODES.size)
     return value, error
 
 
@@ -158,10 +168,9 @@ class _Block:
         light: Light | None,
         names: Index,
         reverse: bool,
-        effort: Counter,
     ) -> None:
         self.term, self.fixed, self.light, self.names = term, np.ascontiguousarray(fixed), light, names
-        self.reverse, self.effort = reverse, effort
+        self.reverse, self.nodes = reverse, 0
         self.width = term.lobe_width()
         self.rounding = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0)) + edge_rounding(region.axis[:, 2], region.half_angle)
         n, axis = len(fixed), np.ascontiguousarray(region.axis)
@@ -225,8 +234,8 @@ class _Block:
                     f"{self.term.model.name}: more than {_LARGEST} nodes around its lobes for one gradient"
                 )
 
-    def run(self, rtol: float, atol: float) -> tuple[Array, Array]:
-        """Refine to the tolerance; value and error (n,)."""
+    def run(self, rtol: float, atol: Array) -> tuple[Array, Array]:
+        """Refine to the tolerance, `atol` of shape (n,); value and error (n,)."""
         n = len(self.fixed)
         value, along, across = self._evaluate(self.base, self.box)
         spent = np.bincount(self.owner[self.base], minlength=n)
@@ -269,22 +278,23 @@ class _Block:
             size = part.stop - start
             directions, weights = np.empty((size, side, side, 3)), np.empty((size, side, side))
             fill(self.cells, self.owner, self.circles, self.frames, base[part], box[part], NODES, directions, weights)
-            flat = directions.reshape(-1, 3)
-            element = np.repeat(self.owner[base[part]], side * side)
-            f_r, fixed = np.zeros(len(flat)), self.fixed[element]
+            flat, element = directions.reshape(-1, 3), self.owner[base[part]]
+            f_r, fixed = np.zeros(len(flat)), np.repeat(self.fixed[element], side * side, axis=0)
             pair = (fixed, flat) if self.reverse else (flat, fixed)
             accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
+            f_r = f_r.reshape(weights.shape)
+            f_r *= weights
             if self.light is not None:
-                f_r *= self.light.radiance(flat, self.names[element])
-            f_r = f_r.reshape(weights.shape) * weights
-            sums = np.einsum("cij,ia,jb->cab", f_r, _RULES, _RULES, optimize=True)
+                f_r *= self.light.radiance(directions.reshape(size, -1, 3), self.names[element]).reshape(weights.shape)
+            along = (f_r.reshape(-1, side) @ _RULES).reshape(size, side, 2)  # sums over chi
+            sums = np.swapaxes((np.swapaxes(along, 1, 2).reshape(-1, side) @ _RULES).reshape(size, 2, 2), 1, 2)
             if not np.all(np.isfinite(sums)):
                 raise ParameterError(
                     f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
                 )
             best = sums[:, 0, 0]
             out[:, part] = best, _SAFETY * np.abs(best - sums[:, 1, 0]), _SAFETY * np.abs(best - sums[:, 0, 1])
-            self.effort.add(f_r.size, side)
+            self.nodes += f_r.size
         return out[0], out[1], out[2]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.fields import EnvironmentMap, Field
+from gonio.fields import EnvironmentMap, Field, FunctionField, Lobes
 from gonio.integrate import closed_forms, diffuse, disk, quadtree, radial
 from gonio.integrate import threads as tiling
 from gonio.integrate.frames import Elements
@@ -27,7 +27,8 @@ from gonio.source import Cap, Collimated
 Array = NDArray[np.float64]
 _FEW = 64  # gradients up to which a table in theta_n does not pay
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
-_TEXELS = 512  # of a bilinear map up to which its cells are few
+_CELLS = 1 << 20  # with which gradients may be done that rings leave above their tolerance: seconds
+_AT_LEAST, _PER_LOBE = 100, 20  # cells that one gradient takes
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
 _SAMPLE_OF_TREE = 0.015
 _MANY = 1 << 19  # gradients from which on a quadtree pays
@@ -145,15 +146,18 @@ class Run:
         return worst
 
     def _rings(self, step: Step, field: Field, threads: int, value: Array, error: Array) -> float:
-        """By rings; few gradients, and those that rings leave above their tolerance, by adaptive cells."""
+        """By rings; few gradients, and those that rings leave above their tolerance, by adaptive cells.
+
+        Rings add waves of either sign, so a value far below the largest at its slope has few digits left; cells add what is
+        positive.
+        """
         grid, rtol = self.gradients, self.rtol
-        coarse = not isinstance(field, EnvironmentMap) or field.samples.size <= _TEXELS
-        most = 4 * _FEW if coarse else _FEW  # for cells
-        handful = coarse and grid.size <= _HANDFUL
+        most = max(_FEW, int(_CELLS / _cells_of(field)))  # for cells
+        handful = most > _FEW and grid.size <= _HANDFUL
         if handful or slopes_are_few(grid):
             elements, spare = grid.elements(), self._spare(value, error)
             if handful:
-                v, e = self._cells(step, field, elements, spare)
+                v, e = self._cells(step, field, elements, spare, threads)
             else:
                 v, e = self._slopes(step, field, elements, spare, most, threads)
             value += v
@@ -170,15 +174,14 @@ class Run:
         done = tiling.run(add, grid.tiles(), threads)
         missed = np.concatenate([index for _, index in done])
         worst = max(relative for relative, _ in done)
-        if 0 < missed.size <= most:
-            some = grid.select(missed)
-            v, e = np.zeros(missed.size), np.zeros(missed.size)
-            table.add(some, (0, missed.size), rtol, self.atol, v, e)
-            spare = self._spare(value[missed] - v, error[missed] - e)
-            again, left = self._cells(step, field, some.elements(), spare)
-            better = left < e
-            value[missed[better]] += (again - v)[better]
-            error[missed[better]] += (left - e)[better]
+        if missed.size == 0:
+            return worst
+        some, v, e = grid.select(missed), np.zeros(missed.size), np.zeros(missed.size)
+        table.add(some, (0, missed.size), rtol, math.inf, v, e)
+        if missed.size <= most:
+            v, e = self._better(step, field, some.elements(), v, e, self._spare(value[missed], error[missed]), threads)
+        value[missed] += v
+        error[missed] += e
         return max(worst, _largest(error[missed], value[missed], negligible))
 
     def _slopes(
@@ -189,18 +192,25 @@ class Run:
         v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare)
         missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
         if 0 < missed.size <= most:
-            again, left = self._cells(step, field, elements.select(missed), spare[missed])
-            better = left < e[missed]
-            v[missed[better]], e[missed[better]] = again[better], left[better]
+            v[missed], e[missed] = self._better(
+                step, field, elements.select(missed), v[missed], e[missed], spare[missed], threads
+            )
         return v, e
+
+    def _better(
+        self, step: Step, field: Field, elements: Elements, v: Array, e: Array, spare: Array, threads: int
+    ) -> tuple[Array, Array]:
+        """Value and error by cells where their error is smaller than the one there is."""
+        again, left = self._cells(step, field, elements, spare, threads)
+        return np.where(left < e, again, v), np.minimum(left, e)
 
     def _spare(self, value: Array, error: Array) -> Array:
         """What steps before leave of the tolerance, which is relative to the sum."""
         return np.maximum(self.atol, 0.5 * (self.rtol * np.abs(value) - error))
 
-    def _cells(self, step: Step, field: Field, elements: Elements, spare: Array) -> tuple[Array, Array]:
-        atol = float(np.min(spare, initial=np.inf))
-        return over_field(step.term, field, elements, rtol=self.rtol, atol=atol, effort=step.effort)
+    def _cells(self, step: Step, field: Field, elements: Elements, spare: Array, threads: int) -> tuple[Array, Array]:
+        cores = 1 if isinstance(field, FunctionField) else threads  # who knows what a user's function can stand
+        return over_field(step.term, field, elements, rtol=self.rtol, atol=spare, effort=step.effort, threads=cores)
 
     def _by_element(self, step: Step, elements: Elements, threads: int) -> tuple[Array, Array]:
         term, part = step.term, step.part
@@ -231,6 +241,13 @@ class Run:
                 features.append((math.pi / 2 - cap.half_angle, 0.02))  # the rim sets
         upper = radial.tau_of_slope(self.gradients.steepest)
         return radial.tabulate(profile, upper, rtol=self.rtol, atol=self.atol, features=features)
+
+
+def _cells_of(field: Field) -> float:
+    """About how many cells a gradient takes."""
+    if isinstance(field, Lobes):
+        return _AT_LEAST + _PER_LOBE * len(field.kappa)
+    return _AT_LEAST + 2.0 * (field.samples.size if isinstance(field, EnvironmentMap) else 1.0 / field.detail**2)
 
 
 def _largest(error: Array, value: Array, negligible: float) -> float:

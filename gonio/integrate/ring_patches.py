@@ -103,7 +103,7 @@ class Table:
         error: Array,
         negligible: float = 0.0,
     ) -> tuple[float, NDArray[np.intp]]:
-        """Add value and error on one tile.
+        """Add value and error on one tile, at those gradients where they are within the tolerance.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Table:
 
         Returns
         -------
-        largest error relative to the sum among those that meet the tolerance, index of those that miss it
+        largest error relative to the sum, index of the gradients that miss the tolerance, which are left as they were
         """
         missed = np.empty(tile[1] - tile[0], dtype=np.int64)
         worst, count = _add(
@@ -335,14 +335,14 @@ def _read_tile(p, q, start, stop, bounds, errors, shapes, first, table, least, r
             if total[m] < least:
                 e = max(e, least - total[m])
                 total[m] = least
-            late = e > max(rtol * abs(total[m]), max(atol, 0.5 * (rtol * abs(value[k + m]) - error[k + m])))
+            if e > max(rtol * abs(total[m]), max(atol, 0.5 * (rtol * abs(value[k + m]) - error[k + m]))):
+                missed[count] = k + m
+                count += 1
+                continue
             value[k + m] += total[m]
             error[k + m] += e
             size = abs(value[k + m])
-            if late:
-                missed[count] = k + m
-                count += 1
-            elif e > worst * size and e > negligible and size > 0.0:
+            if e > worst * size and e > negligible and size > 0.0:
                 worst = e / size
         k += n
     return worst, count

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio.brdf.base import Term
-from gonio.fields import EnvironmentMap, Field
+from gonio.fields import EnvironmentMap, Field, FunctionField
 from gonio.integrate import threads
 from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients
@@ -31,11 +31,12 @@ FEW = 96  # distinct slopes up to which each is summed by itself
 
 
 def scene_of(term: Term, field: Field, rtol: float, effort: Effort, cores: int | None) -> Scene:
-    """One isotropic, compiled term and one field, with the field's waves to a millionth of the tolerance."""
+    """One isotropic, compiled term and one field, with the field's waves to rounding, or a millionth of the tolerance."""
+    to = 1e-6 if isinstance(field, FunctionField) else 1e-8  # which of the values far below the largest are good to rtol
     columns = field.samples.shape[1] if isinstance(field, EnvironmentMap) else 0
     return Scene(
         term,
-        spectrum(field, max(1e-6 * rtol, 1e-14)),
+        spectrum(field, max(to * rtol, 1e-14)),
         isinstance(field, EnvironmentMap),
         term.lobe_width() or NONE,
         cores or threads.available(),

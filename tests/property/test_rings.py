@@ -157,3 +157,21 @@ def test_a_sharp_lobe_on_paper_against_independent_values() -> None:
         got = gonio.reflectance_map(make_brdf("lambertian", albedo=0.3), make_source(**part), p, q, rtol=rtol)
         off = np.abs(got.value[-2:] - truth) - 2e-11 * truth
         assert np.all(off <= got.error[-2:]) and np.all(off <= rtol * truth)
+
+
+@pytest.mark.parametrize(
+    ("term", "steepest"), [({"model": "lambertian", "albedo": 0.3}, 9.0), ({"model": "phong", "k_s": 0.5, "n": 50.0}, 1.5)]
+)
+def test_pixels_far_darker_than_the_brightest_against_independent_values(term: dict[str, object], steepest: float) -> None:
+    """Waves cancel where the lobe of light has set, or its mirror image is far: no digit of such a sum would be left."""
+    part = {"kind": "lobes", "amplitude": 2.0, "kappa": 100.0, "theta": 0.7, "phi": 1.0}
+    p, q = (a.ravel() for a in np.meshgrid(*[np.linspace(-0.6 * steepest, steepest, 12)] * 2))
+    material = make_brdf(**{"name": term["model"]} | {k: v for k, v in term.items() if k != "model"})
+    got = gonio.reflectance_map(material, make_source(**part), p, q, rtol=1e-6, atol=1e-30)
+    rows = np.argsort(np.where(got.value > 1e-24, got.value, np.inf))[[0, 5, 15, 25]]
+    scenes = [{"brdf": [term], "source": [part], "p": p[k], "q": q[k]} for k in rows]
+    truth = np.array([reflected_radiance(scene, "normal", 1e-10) for scene in scenes])
+    assert 0.0 < truth[0] < 1e-9 * got.value.max()
+    off = np.abs(got.value[rows] - truth) - 2e-10 * truth
+    assert np.all(off <= got.error[rows]) and np.all(off <= 1e-6 * truth)
+    assert np.all(got.error <= 1.0001e-6 * got.value + 1e-30)
