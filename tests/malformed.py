@@ -39,6 +39,7 @@ LIGHTTOOLS = (
 OPENMATERIAL = (
     b'{"metadata": {"name": "x"}, "brdf": {"lookupTable": [[5.5e-7, 0.5, 0.2, 3.0, 0.1], [5.5e-7, 0.6, 0.2, 3.0, 0.2]]}}'
 )
+SCATTERED = [[(400 + k % 2000) * 1e-9, 1e-4 * k, 0.2, 3.0, 0.1] for k in range(12_000)]  # each wavelength elsewhere
 
 
 def bird() -> bytes:
@@ -125,16 +126,17 @@ def deep(n: int) -> bytes:
     return b'{"metadata": 1, "BRDF": ' + b"[" * n + b"]" * n + b"}"
 
 
-def poke(at: int, form: str, value: int) -> Edit:
+def poke(at: int, form: str, *values: int) -> Edit:
     def edit(data: bytes) -> bytes:
         out = bytearray(data)
-        struct.pack_into(form, out, at, value)
+        struct.pack_into(form, out, at, *values)
         return bytes(out)
 
     return edit
 
 
 NAN = np.full((1, 2, 3, 4, 4), np.nan, dtype="<f4")
+VNDF_SHAPE = rgl().index(b"vndf") + len("vndf") + 2 + 1 + 8
 FIRST_FIELD = 18 + 2 + len("theta_i")  # where its dimensions stand
 GOOD: dict[str, Callable[[Path], bytes]] = {
     "csv": lambda _: CSV,
@@ -266,6 +268,7 @@ BAD: list[tuple[str, Edit, str]] = [
     ("openmaterial", swap('"brdf"', '"bsdf"'), "'brdf' must be an object, and is missing"),
     ("openmaterial", put("brdf.lookupTable", {}), "'lookupTable' must be a list, and is not"),
     ("openmaterial", put("brdf.lookupTable", []), "lookupTable holds no value"),
+    ("openmaterial", put("brdf.lookupTable", SCATTERED), "12000 directions times 2000 wavelengths"),
     ("bird", lambda d: d[:-9], "line 1: not JSON"),
     ("bird", give(deep(100_000)), "nested without end"),
     ("bird", give(b'{"metadata": 1, "metadata": 2, "BRDF": 1}'), "'metadata' stands twice"),
@@ -306,6 +309,7 @@ BAD: list[tuple[str, Edit, str]] = [
     ("rgl", poke(FIRST_FIELD + 2, "<B", 77), "type 77 and 1 dimensions"),
     ("rgl", poke(FIRST_FIELD + 3, "<Q", 2**63), "at 9223372036854775808 is beyond"),
     ("rgl", poke(FIRST_FIELD + 11, "<Q", 2**62), "field 'theta_i' of 4611686018427387904 values"),
+    ("rgl", poke(VNDF_SHAPE, "<4Q", 0, 2**62, 2**40, 4), "the field vndf has shape (0,)"),
     ("rgl", give(rgl(vndf=None)), "the field vndf is missing"),
     ("rgl", give(rgl(rgb=None)), "neither a table rgb nor spectra"),
     ("rgl", give(rgl(rgb=NAN)), "a value of rgb is not finite"),

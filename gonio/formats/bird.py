@@ -81,6 +81,7 @@ def read(path: Path) -> ChannelSamples:
     where = np.stack([c[keep] for c in columns], axis=-1)
     pairs, index = np.unique(where, axis=0, return_inverse=True)
     index = index.ravel()
+    rows.check_size(path, len(pairs), len(names))
     value, uncertainty = np.full((len(pairs), len(names)), np.nan), np.full((len(pairs), len(names)), np.nan)
     if len(np.unique(index * len(names) + key[keep])) != np.count_nonzero(keep):  # directions measured more than once
         if len(names) > 1:

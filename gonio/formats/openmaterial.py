@@ -59,6 +59,7 @@ def read(path: Path) -> ChannelSamples:
     if not np.any(keep):
         raise DatasetError(f"{path} holds no sample above the horizon")
     pairs, index = np.unique(data[keep, 1:4], axis=0, return_inverse=True)
+    rows.check_size(path, len(pairs), len(waves))
     value = np.full((len(pairs), len(waves)), np.nan)
     value[index.ravel(), key.ravel()[keep]] = data[keep, 4]
     attributes = {

@@ -13,6 +13,7 @@ from gonio.channels import Channels, ChannelSamples
 from gonio.errors import DatasetError
 
 Array = NDArray[np.float64]
+MOST = 20_000_000  # values of a table of directions and channels
 
 
 def parse(path: Path, lines: Iterable[tuple[int, Sequence[str]]], columns: int) -> tuple[Array, list[int]]:
@@ -59,6 +60,15 @@ def text(found: ChannelSamples, separator: str) -> str:
     """Lines theta_i, phi_i, theta_r, phi_r [rad] and the values, digits enough to come back bit for bit."""
     table = np.concatenate((np.stack((found.theta_i, found.phi_i, found.theta_r, found.phi_r), axis=-1), found.f_r), axis=1)
     return "".join(separator.join(map(repr, row)) + "\n" for row in table.tolist())
+
+
+def check_size(path: Path, pairs: int, channels: int) -> None:
+    """Refuse rows whose directions differ from wavelength to wavelength so much that a table of both fills the memory."""
+    if pairs * channels > MOST:
+        raise DatasetError(
+            f"{path}: {pairs} directions times {channels} wavelengths are more than {MOST} values, as most directions have "
+            "few wavelengths; split the file by wavelength"
+        )
 
 
 def one_line(text: object, most: int = 500) -> str:

@@ -68,7 +68,8 @@ def read(path: Path) -> Fields:
             raise DatasetError(f"{path}: field {shown} of {n} values at {offset} is beyond the file's {len(data)} bytes")
         if name in fields:
             raise DatasetError(f"{path}: field {shown} stands twice; the file is damaged")
-        fields[name] = np.frombuffer(data, dtype=dtype, count=n, offset=offset).reshape(shape)
+        # an empty field may announce any other sizes, more than numpy can hold
+        fields[name] = np.frombuffer(data, dtype=dtype, count=n, offset=offset).reshape(shape if n else (0,))
     return fields
 
 
