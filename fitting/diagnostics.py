@@ -112,6 +112,10 @@ def advice(
     noise: str,
     discrepancy: bool,
     acceptance: float,
+    outliers: int = 0,
+    robust: bool = False,
+    scaled: bool = False,
+    incidences: int = 2,
 ) -> list[str]:
     """What a user should know about this fit, one sentence each; nothing if all is well.
 
@@ -128,22 +132,40 @@ def advice(
         A model discrepancy was inferred.
     acceptance : float
         Fraction of accepted moves.
+    outliers : int
+        Samples far from the model.
+    robust : bool
+        Student's t was the likelihood.
+    scaled : bool
+        A common factor of the stated uncertainties was inferred.
+    incidences : int
+        Different theta_i of the samples.
     """
     said = []
     limit = misfit_limit(n_samples)
     if n_samples < n_parameters:
         said.append(f"{n_samples} samples for {n_parameters} parameters: the priors decide; measure more or fix some")
-    if noise != "inferred" and chi2_per_n > limit:
+    if incidences < 2:
+        said.append("all samples have one theta_i: for others the fit is what the model's form makes of it; measure at more")
+    if noise != "inferred" and chi2_per_n > limit and not (robust and outliers <= 0.05 * n_samples):
         consequence = (
             "the intervals include an inferred model discrepancy (noise.discrepancy)"
             if discrepancy
+            else "the intervals include an inferred factor of the uncertainties (noise.scale)"
+            if scaled
             else "the intervals are too narrow; allow a discrepancy"
         )
         said.append(
             f"chi2/N = {chi2_per_n:.3g}, expected 1: the model does not describe the data within their stated "
             f"uncertainty; {consequence}; try another model or look for a fault of the measurement"
         )
-    if noise == "stated" and not discrepancy and n_samples >= 20 and chi2_per_n < 1.0 - 4.0 * math.sqrt(2.0 / n_samples):
+    if outliers:
+        said.append(
+            f"{outliers} of {n_samples} samples are more than 5 standard deviations from the model (diagnostics: outliers)"
+            + ("; Student's t gives them little weight" if robust else "; look at them, or fit with Student's t")
+        )
+    expected = noise == "stated" and not (discrepancy or scaled) and n_samples >= 20
+    if expected and chi2_per_n < 1.0 - 4.0 * math.sqrt(2.0 / n_samples):
         said.append(f"chi2/N = {chi2_per_n:.3g}, expected 1: the stated uncertainties, and so the intervals, are too large")
     if noise == "inferred":
         said.append(

@@ -3,8 +3,8 @@ r"""The likelihood of BRDF samples: shared errors as parameters, independent one
 With the expected reading of `gonio.samples`,
 
 .. math:: \ln L = -\tfrac12\sum_j\Bigl[\frac{(f_j-\hat f_j)^2}{s_j^2}+\ln s_j^2\Bigr],\qquad
-   s_j^2 = u_j^2 + \sum_k\Bigl(\frac{\partial\hat f_j}{\partial\delta_k}\,u_{\mathrm{sample},k}\Bigr)^2
-         + (\epsilon\hat f_j)^2 + [u_j\ \text{unknown}]\,\bigl((r\hat f_j)^2+a^2\bigr).
+   s_j^2 = (s\,u_j)^2 + \sum_k\Bigl(\frac{\partial\hat f_j}{\partial\delta_k}\,u_{\mathrm{sample},k}\Bigr)^2
+         + (\epsilon\hat f_j)^2 + [u_j\ \text{unknown}]\,\bigl((r\hat f_j)^2+a^2\bigr),
 
 Every part of the variance that scales with the reading is taken from the model, never from the noisy reading, which
 would pull the fit towards low readings; so the term ln s^2 stays. The slope is a finite difference of the compiled model
@@ -12,12 +12,18 @@ at the parameters of the moment: a slope frozen at the optimum would let a walke
 a wider one. It is linear in the angular error, so `u_sample` must be small against the width of a lobe.
 
 `noise.relative` (r) and `noise.absolute` (a) are inferred where a sample has no uncertainty; `noise.discrepancy`
-(epsilon) allows for a model that is not the material. This module draws nothing and chooses no parameters.
+(epsilon) allows for a model that is not the material, and `noise.scale` (s, 1 unless freed) for stated uncertainties that
+are wrong by a common factor. For stray readings there is Student's t instead of Gauss, with s_j as its scale [3]_:
+:math:`-\tfrac12\sum_j[(\nu+1)\ln(1+(f_j-\hat f_j)^2/(\nu s_j^2))+\ln s_j^2]`.
+
+Walkers are evaluated some at a time, so that a block stays in the cache; on several threads if asked for, with the same
+numbers. This module draws nothing and chooses no parameters.
 
 References
 ----------
 .. [1] JCGM 100:2008 (GUM), 5.1.2 and 5.2.2: propagation by sensitivity coefficients, independent and correlated.
 .. [2] M. C. Kennedy, A. O'Hagan, "Bayesian calibration of computer models", JRSS B 63(3), 2001: model discrepancy.
+.. [3] K. L. Lange, R. J. A. Little, J. M. G. Taylor, "Robust statistical modeling using the t distribution", JASA 84, 1989.
 """
 
 from __future__ import annotations
@@ -25,6 +31,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -32,14 +39,16 @@ from numpy.typing import NDArray
 
 from fitting.parameters import Declared, Space, declare
 from gonio import jit
-from gonio.brdf import Model
+from gonio.brdf import Model, term_names
+from gonio.brdf.elementary import exp, log, log1p
 from gonio.errors import DatasetError, ParameterError
 from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
 STEP = 1e-6  # of a shared error, for slopes: f'' STEP / f' is 1e-5 for a lobe of 0.1 rad, rounding 1e-10
 BLOCK = 512  # samples at a time: one block of 16 walkers and 4 geometries stays in the cache
-RELATIVE, ABSOLUTE, DISCREPANCY = "noise.relative", "noise.absolute", "noise.discrepancy"
+WALKERS = 16  # at a time
+RELATIVE, ABSOLUTE, DISCREPANCY, SCALE = "noise.relative", "noise.absolute", "noise.discrepancy", "noise.scale"
 
 
 def _directions(base, slope, full, offset, varied, step, out):  # type: ignore[no-untyped-def]
@@ -92,15 +101,17 @@ def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_
         if has_log:
             factor[:] = 0.0
             for k in range(log_slope.shape[0]):
-                delta = full[w, offset + k]
-                for j in range(n):
-                    factor[j] += delta * log_slope[k, j]
+                delta, by = full[w, offset + k], log_slope[k]
+                if delta != 0.0:
+                    for j in range(n):
+                        factor[j] += delta * by[j]
             for j in range(n):
-                factor[j] = math.exp(factor[j])
+                factor[j] = exp(factor[j])
         relative2, absolute2, epsilon2 = full[w, noise] ** 2, full[w, noise + 1] ** 2, full[w, noise + 2] ** 2
+        scale2 = full[w, noise + 3] ** 2
         for j in range(n):
             m[j] = f[j] * factor[j]
-            s2[j] = u2[j] + epsilon2 * m[j] * m[j] + unknown[j] * (relative2 * m[j] * m[j] + absolute2)
+            s2[j] = scale2 * u2[j] + epsilon2 * m[j] * m[j] + unknown[j] * (relative2 * m[j] * m[j] + absolute2)
         for q in range(noisy.size):
             k = noisy[q]
             shifted = values[w, variant[q]]  # the unshifted geometry itself where the error does not turn anything
@@ -109,15 +120,21 @@ def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_
                 s2[j] += d * d
 
 
-def _reduce(mean, var, reading, log_likelihood, chi2):  # type: ignore[no-untyped-def]
+def _reduce(mean, var, reading, nu, log_likelihood, chi2):  # type: ignore[no-untyped-def]
     for w in range(mean.shape[0]):
         c, l = 0.0, 0.0
         for j in range(reading.size):
             r = reading[j] - mean[w, j]
             c += r * r / var[w, j]
         for j in range(reading.size):
-            l += math.log(var[w, j])
+            l += log(var[w, j])
         chi2[w] += c
+        if nu > 0.0:
+            c = 0.0
+            for j in range(reading.size):
+                r = reading[j] - mean[w, j]
+                c += log1p(r * r / (nu * var[w, j]))
+            c *= nu + 1.0
         log_likelihood[w] -= 0.5 * (c + l)
 
 
@@ -155,11 +172,12 @@ def shared_parameters(samples: BRDFSamples, use: bool) -> list[Declared]:
 
 
 def noise_parameters(samples: BRDFSamples, discrepancy: bool) -> list[Declared]:
-    """``noise.relative``, ``noise.absolute`` and ``noise.discrepancy``, held at 0 where they are not needed.
+    """``noise.relative``, ``noise.absolute`` and ``noise.discrepancy``, held at 0 where they are not needed, and
+    ``noise.scale``, held at 1.
 
     The priors are half-normal and wide: sd 0.3 for r; the root mean square of the readings without an uncertainty for a;
     0.1 for epsilon. The lower ends, 1e-4 and 1e-6 of the scale, keep the likelihood finite for noise-free data; no
-    goniometer repeats better.
+    goniometer repeats better. That of s is flat in its logarithm from 0.01 to 100.
     """
     unknown = np.isnan(samples.u_f_r)
     rms = float(np.sqrt(np.mean(samples.f_r[unknown] ** 2))) if unknown.any() else 1.0
@@ -169,6 +187,7 @@ def noise_parameters(samples: BRDFSamples, discrepancy: bool) -> list[Declared]:
         Declared(RELATIVE, 1e-4, 3.0, ("half_normal", 0.3), "1", infer),
         Declared(ABSOLUTE, 1e-6 * rms, 10.0 * rms, ("half_normal", rms), "1/sr", infer),
         Declared(DISCREPANCY, 1e-4, 3.0, ("half_normal", 0.1), "1", None if discrepancy else 0.0),
+        Declared(SCALE, 0.01, 100.0, ("log_uniform", 0.01, 100.0), "1", 1.0),
     ]
 
 
@@ -186,6 +205,15 @@ class Problem:
         Infer the shared errors; False holds them at 0.
     discrepancy : bool
         Infer ``noise.discrepancy``.
+    student : float, optional
+        Degrees of freedom of Student's t in place of Gauss.
+    threads : int
+        For log densities of several walkers.
+
+    Attributes
+    ----------
+    fixed_variances : bool
+        The variances depend on no parameter but ``noise.scale``.
 
     Raises
     ------
@@ -205,6 +233,8 @@ class Problem:
         priors: dict[str, Sequence[object]] | None = None,
         shared: bool = True,
         discrepancy: bool = False,
+        student: float | None = None,
+        threads: int = 1,
     ) -> None:
         if len(samples) == 0:
             raise DatasetError("there are no samples to fit: scan or import some first")
@@ -214,7 +244,11 @@ class Problem:
         if np.any((samples.f_r != 0) & (np.abs(samples.f_r) > 1e100)):
             worst = int(np.argmax(np.abs(samples.f_r)))
             raise DatasetError(f"sample {worst} has f_r = {samples.f_r[worst]:g} 1/sr; that is no reading, remove it")
-        self.samples, self.models = samples, tuple(models)
+        if student is not None and not (math.isfinite(student) and student >= 1.0):
+            raise ParameterError(f"student = {student:g} degrees of freedom; choose 1 or more, such as 4")
+        if threads < 1:
+            raise ParameterError(f"threads = {threads}; choose 1 or more")
+        self.samples, self.models, self.student, self.threads = samples, tuple(models), student, threads
         own = declare(self.models)
         errors = shared_parameters(samples, shared)
         self.space = Space(
@@ -224,9 +258,12 @@ class Problem:
         if not self.model_names:
             raise ParameterError("every parameter of the model is fixed; free at least one")
         starts = np.cumsum([0, *(len(m.parameters) for m in self.models)])
-        self._terms = [(m, int(a)) for m, a in zip(self.models, starts, strict=False) if m.function is not None]
+        self.terms = tuple(zip(term_names(self.models), self.models, map(int, starts[:-1]), strict=True))
         self._offset, self._noise = len(own), len(own) + len(errors)
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._geometry(errors)
+        held = self.space.fixed.get(DISCREPANCY) == 0.0
+        self.fixed_variances = held and self._noisy.size == 0 and not np.isnan(samples.u_f_r).any() and student is None
 
     def _geometry(self, errors: Sequence[Declared]) -> None:
         """Arrays of the kernels, component by component and cut into blocks."""
@@ -262,19 +299,40 @@ class Problem:
                 _directions_kernel(block[0], block[1], constant, self._offset, self._varied, STEP, held)
             self._blocks.append((block, held))
 
+    @property
+    def blocks(self) -> range:
+        """Numbers of the blocks into which the samples are cut, in order."""
+        return range(len(self._blocks))
+
+    def directions(self, full: Array, index: int) -> Array:
+        """Unit vectors of a block of samples with all shared errors, shape (w or 1, 1 + v, 6, n)."""
+        (base, slope, *_), held = self._blocks[index]
+        if held is not None:
+            return held
+        out = np.empty((len(full), 1 + len(self._varied), 6, base.shape[1]))
+        _directions_kernel(base, slope, full, self._offset, self._varied, STEP, out)
+        return out
+
+    def add_term(self, term: int, full: Array, directions: Array, out: Array) -> None:
+        """Add f_r of one term to `out`, shape (w, 1 + v, n); the shared errors turn directions and do nothing else."""
+        _, model, first = self.terms[term]
+        parameters = np.ascontiguousarray(full[:, first : first + len(model.parameters)])
+        if model.derived is not None:
+            parameters = np.array([model.complete(row) for row in parameters])
+        _term_kernel(model.function)(directions, parameters, out)
+
+    def log_slopes(self, index: int) -> tuple[Array, int, bool]:
+        """Derivatives (k, n) of the logarithm of a block's readings by the shared errors; the place of the first of those in
+        the parameter array; whether there is any that is not 0."""
+        return self._blocks[index][0][2], self._offset, self._has_log
+
     def _moments_of(self, full: Array, index: int) -> tuple[Array, Array]:
-        (base, slope, log_slope, u2, unknown, _), directions = self._blocks[index]
-        shape = (len(full), 1 + len(self._varied), base.shape[1])
-        if directions is None:
-            directions = np.empty((shape[0], shape[1], 6, shape[2]))
-            _directions_kernel(base, slope, full, self._offset, self._varied, STEP, directions)
-        values = np.zeros(shape)
-        for model, first in self._terms:
-            parameters = np.ascontiguousarray(full[:, first : first + len(model.parameters)])
-            if model.derived is not None:
-                parameters = np.array([model.complete(row) for row in parameters])
-            _term_kernel(model.function)(directions, parameters, values)
-        mean, var = np.empty((shape[0], shape[2])), np.empty((shape[0], shape[2]))
+        (_, _, log_slope, u2, unknown, _), _ = self._blocks[index]
+        directions = self.directions(full, index)
+        values = np.zeros((len(full), *directions.shape[1::2]))
+        for term in range(len(self.terms)):
+            self.add_term(term, full, directions, values)
+        mean, var = np.empty((len(full), u2.size)), np.empty((len(full), u2.size))
         _moments_kernel(
             values, full, self._offset, self._noise, log_slope, self._has_log, self._noisy, self._variant,
             self._u_sample, STEP, u2, unknown, mean, var,
@@ -284,22 +342,33 @@ class Problem:
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Expected readings [1/sr] and their variances [1/sr^2], each (w, n), for free parameters x, shape (w, d)."""
         full = self.space.full(np.atleast_2d(x))
-        parts = [self._moments_of(full, i) for i in range(len(self._blocks))]
+        parts = [self._moments_of(full, i) for i in self.blocks]
         return np.concatenate([m for m, _ in parts], axis=1), np.concatenate([v for _, v in parts], axis=1)
+
+    def in_parts(self, function: Callable[[Array], tuple[Array, ...]], rows: Array) -> tuple[Array, ...]:
+        """What a function of some rows (w, ...) gives, put together again; on several threads if there are some."""
+        step = max(1, min(WALKERS, -(-len(rows) // self.threads)))
+        parts = [rows[a : a + step] for a in range(0, len(rows), step)]
+        found = list(map(function, parts) if self._pool is None or len(parts) == 1 else self._pool.map(function, parts))
+        return found[0] if len(found) == 1 else tuple(np.concatenate(column) for column in zip(*found, strict=True))
 
     def log_likelihood(self, x: Array, *, stated: bool = False) -> tuple[Array, Array]:
         """ln L (up to a constant; -inf where it is not finite) and chi^2, each (w,), for free parameters x, (w, d).
 
-        `stated` leaves the model's discrepancy out of the variances.
+        `stated` leaves the model's discrepancy and the scale of the noise out of the variances.
         """
         full = self.space.full(x)
         if stated:
-            full[:, self._noise + 2] = 0.0
+            full[:, self._noise + 2], full[:, self._noise + 3] = 0.0, 1.0
+        total, chi2 = self.in_parts(self._log_likelihood, full)
+        return np.where(np.isfinite(total), total, -np.inf), chi2
+
+    def _log_likelihood(self, full: Array) -> tuple[Array, ...]:
         total, chi2 = np.zeros(len(full)), np.zeros(len(full))
         for i, (block, _) in enumerate(self._blocks):
             mean, var = self._moments_of(full, i)
-            _reduce_kernel(mean, var, block[5], total, chi2)
-        return np.where(np.isfinite(total), total, -np.inf), chi2
+            _reduce_kernel(mean, var, block[5], self.student or 0.0, total, chi2)
+        return total, chi2
 
     def log_probability(self, u: Array) -> Array:
         """Log posterior density of the unbounded coordinates, up to a constant: (w, d) -> (w,); never NaN."""

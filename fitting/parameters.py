@@ -62,8 +62,10 @@ def declare(models: Sequence[Model]) -> list[Declared]:
     """The parameters of a sum of models, in the order of their parameter arrays."""
     declared = []
     for term, model in zip(term_names(models), models, strict=True):
-        if model.function is None:
+        if model.delta:
             raise ParameterError(f"{model.name} is a delta function and has no value at a pair of directions; leave it out")
+        if model.function is None:
+            raise ParameterError(f"{model.name} is not compiled, as a fit needs it; write it with @gonio.jit.model")
         declared += [Declared(f"{term}.{p.name}", p.lower, p.upper, p.prior, p.unit, p.fixed) for p in model.parameters]
     return declared
 
@@ -155,8 +157,9 @@ class Space:
         priors: Mapping[str, Sequence[object]] | None = None,
     ) -> None:
         self.declared = tuple(declared)
+        self._given = (tuple(free), dict(fix or {}), dict(priors or {}))
+        free, fix, priors = self._given
         known = [p.name for p in self.declared]
-        free, fix, priors = tuple(free), dict(fix or {}), dict(priors or {})
         for option, names in (("free", free), ("fix", fix), ("priors", priors)):
             for name in names:
                 if name not in known:
@@ -229,6 +232,22 @@ class Space:
                 s = np.log(np.maximum(x[:, i], q.lower) / q.lower) / math.log(q.upper / q.lower)
             u[:, i] = ndtri(np.clip(s, 1e-9, 1.0 - 1e-9))
         return u
+
+    def without(self, names: Iterable[str]) -> Space:
+        """The space of the other parameters; the named ones are held somewhere in their range."""
+        gone = set(names)
+        free, fix, priors = self._given
+        place = {p.name: p.lower if math.isfinite(p.lower) else 0.0 for p in self.declared if p.name in gone}
+        return Space(
+            self.declared,
+            free=[name for name in free if name not in gone],
+            fix=fix | place,
+            priors={name: q for name, q in priors.items() if name not in gone},
+        )
+
+    def log_density(self, x: Array) -> Array:
+        """Log prior density of natural values, shape (w, d) -> (w,), up to a constant."""
+        return np.asarray(sum((q.log_density(x[:, i]) for i, q in enumerate(self.priors)), np.zeros(len(x))))
 
     def full(self, x: Array) -> Array:
         """All declared parameters, shape (w, number declared), from the free ones, shape (w, d)."""

@@ -5,7 +5,8 @@ snooker move of emcee 3.1.6 is not used: it samples a distribution that is too n
 
 The ensembles share nothing but the likelihood, so that comparing them means something. Sampling ends when the chain kept
 after burn-in is longer than `Rule.taus` autocorrelation times, that time has settled, and the ensembles agree; or after
-`Rule.max_steps`, which is a status and not an error. No clock decides, so a seed gives the same bytes on a busy machine.
+`Rule.max_steps`, which is a status and not an error. No clock decides, so a seed gives the same bytes on a busy machine. A
+`Walk` holds all that is needed to go on, and whoever does so gets the bytes of a run that was never stopped.
 
 References
 ----------
@@ -17,8 +18,8 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -50,9 +51,11 @@ class Rule:
     drift : float
         Largest relative change of the longest autocorrelation time since the last check.
     first, growth : int, float
-        Steps at the first check, and the least ratio of one check to the next; at most 2, towards the length needed.
+        Steps at the first check, and the ratio of one check to the next.
     max_steps : int
         Per ensemble.
+    effective : int
+        Draws wanted where importance sampling does, in `ensembles` parts.
     """
 
     ensembles: int = 4
@@ -61,13 +64,44 @@ class Rule:
     burn_taus: float = 10.0
     drift: float = 0.02
     first: int = 200
-    growth: float = 1.15
+    growth: float = 1.25
     max_steps: int = 10000
+    effective: int = 4000
 
     def __post_init__(self) -> None:
-        for name in ("ensembles", "first", "max_steps"):
+        for name in ("ensembles", "first", "max_steps", "effective"):
             if getattr(self, name) < 1:
                 raise ParameterError(f"{name} = {getattr(self, name)} leaves nothing to sample; choose 1 or more")
+
+    def checks(self) -> Iterator[int]:
+        """Steps at which a run asks whether to stop, whatever its largest number is."""
+        at = self.first
+        while True:
+            yield at
+            at = math.ceil(at * self.growth)
+
+
+@dataclass(frozen=True)
+class Walk:
+    """All steps of all ensembles, and what the next ones depend on.
+
+    Attributes
+    ----------
+    u : ndarray, shape (ensemble, step, walker, d)
+    log_probability : ndarray, shape (ensemble, step, walker)
+    accepted : ndarray, shape (ensemble, walker)
+        Numbers of accepted moves.
+    keys : ndarray of uint32, shape (ensemble, 624)
+        State of the Mersenne twisters.
+    places : ndarray, shape (ensemble, 3)
+        Position in it, and the normal number kept for the next call: whether there is one, and its value.
+    """
+
+    u: Array
+    log_probability: Array
+    accepted: Array
+    keys: NDArray[np.uint32]
+    places: Array
 
 
 @dataclass(frozen=True)
@@ -88,6 +122,8 @@ class Chains:
         Why it stopped, in one sentence.
     steps, burn_in : int
         Per ensemble.
+    walk : Walk
+        To go on with.
     """
 
     u: Array
@@ -99,6 +135,7 @@ class Chains:
     status: str
     steps: int
     burn_in: int
+    walk: Walk
 
 
 def moves() -> list[tuple[Any, float]]:
@@ -116,8 +153,9 @@ def run(
     quantities: Callable[[Array], Array] | None = None,
     rule: Rule | None = None,
     progress: Progress | None = None,
+    walk: Walk | None = None,
 ) -> Chains:
-    """Sample a density, starting from its modes.
+    """Sample a density, starting from its modes or where an earlier run stopped.
 
     Parameters
     ----------
@@ -132,63 +170,118 @@ def run(
     rule : Rule, optional
     progress : callable, optional
         ``progress(done, total)`` with steps of all ensembles; the total is an estimate that may change.
+    walk : Walk, optional
+        Of an earlier run of the same density and rule, to go on with; `modes` and `seed` then do not matter.
 
     Raises
     ------
     ConvergenceError
         If no start has a finite density.
     """
-    import emcee
-
     rule = rule or Rule()
+    if walk is not None and walk.u.shape[1] > rule.max_steps:
+        raise ParameterError(f"the chains have {walk.u.shape[1]} steps already; raise max_steps (now {rule.max_steps})")
     d = len(modes[0].u)
-    walkers = rule.walkers or max(32, 4 * d)
-    samplers, states = [], []
-    for sequence in np.random.SeedSequence(seed).spawn(rule.ensembles):
-        first, second = sequence.spawn(2)
-        states.append(_start(log_probability, modes, walkers, np.random.default_rng(first)))
-        sampler = emcee.EnsembleSampler(walkers, d, log_probability, moves=moves(), vectorize=True)
-        sampler.random_state = np.random.RandomState(np.random.MT19937(second)).get_state()
-        samplers.append(sampler)
-    fresh: list[Any] = list(states)
-    steps, target, total, before = 0, rule.first, rule.first, math.inf
-    while True:
-        target = min(rule.max_steps, max(target, math.ceil(steps * rule.growth)))
+    if walk is not None:
+        ensembles = [_Ensemble(log_probability, walk, e) for e in range(rule.ensembles)]
+    else:
+        ensembles = []
+        walkers = rule.walkers or max(32, 4 * d)
+        for sequence in np.random.SeedSequence(seed).spawn(rule.ensembles):
+            first, second = sequence.spawn(2)
+            start = _start(log_probability, modes, walkers, np.random.default_rng(first))
+            ensembles.append(_Ensemble(log_probability, _fresh(start, np.random.RandomState(np.random.MT19937(second))), 0))
+    before, total = 1, rule.first
+    for check in rule.checks():
+        target = min(rule.max_steps, check)
+        steps = ensembles[0].steps
+        if target < steps:
+            before = check
+            continue
         total = min(rule.max_steps, max(total, target))
-        for e, sampler in enumerate(samplers):
+        for e, ensemble in enumerate(ensembles):
             for a in range(steps, target, _CHUNK):
                 b = min(a + _CHUNK, target)
-                fresh[e] = sampler.run_mcmc(fresh[e], b - a, skip_initial_state_check=a > 0)
+                ensemble.go(b - a)
                 if progress is not None:
                     progress(steps * rule.ensembles + e * (target - steps) + b - steps, total * rule.ensembles)
-        steps = target
-        chain = np.stack([s.get_chain() for s in samplers])  # (ensemble, step, walker, d)
-        judged = chain if quantities is None else quantities(chain.reshape(-1, d)).reshape(chain.shape)
+        whole = _together(ensembles)
+        judged = whole.u if quantities is None else quantities(whole.u.reshape(-1, d)).reshape(whole.u.shape)
         tau, burn_in = _settle(judged, rule)
+        longest, earlier = float(tau.max()), float(_settle(judged[:, :before], rule)[0].max())
         kept = judged[:, burn_in:]
-        rhat = split_rhat(kept[:, :: max(1, int(tau.max() / 2))].reshape(rule.ensembles, -1, d))
-        long_enough = kept.shape[1] > rule.taus * float(tau.max())
-        longest = float(tau.max())
-        moved, before = abs(longest - before) / longest, longest
-        agree = bool(np.all(rhat < RHAT_LIMIT))
-        total = math.ceil(1.05 * (rule.taus + rule.burn_taus) * longest)
-        target = min(total, 2 * steps)
-        if (long_enough and moved < rule.drift and agree) or steps >= rule.max_steps:
+        rhat = split_rhat(kept[:, :: max(1, int(longest / 2))].reshape(rule.ensembles, -1, d))
+        moved = abs(longest - earlier) / longest if before >= rule.first else math.inf
+        converged = kept.shape[1] > rule.taus * longest and moved < rule.drift and bool(np.all(rhat < RHAT_LIMIT))
+        total, before = math.ceil(1.05 * (rule.taus + rule.burn_taus) * longest), check
+        if converged or target >= rule.max_steps:
             break
-    converged = long_enough and moved < rule.drift and agree
     if progress is not None:
-        progress(steps * rule.ensembles, steps * rule.ensembles)
+        progress(target * rule.ensembles, target * rule.ensembles)
     return Chains(
-        u=chain[:, burn_in:],
-        log_probability=np.stack([s.get_log_prob() for s in samplers])[:, burn_in:],
+        u=whole.u[:, burn_in:],
+        log_probability=whole.log_probability[:, burn_in:],
         tau=tau,
         rhat=rhat,
-        acceptance=float(np.mean([s.acceptance_fraction for s in samplers])),
+        acceptance=float(np.mean(whole.accepted)) / target,
         converged=converged,
         status=_status(converged, kept.shape[1], tau, moved, rhat, rule),
-        steps=steps,
+        steps=target,
         burn_in=burn_in,
+        walk=whole,
     )
+
+
+class _Ensemble:
+    """One ensemble of emcee that goes on from a walk."""
+
+    def __init__(self, log_probability: Callable[[Array], Array], walk: Walk, number: int) -> None:
+        import emcee
+
+        self._past = Walk(*(getattr(walk, f.name)[number] for f in fields(Walk)))
+        walkers, d = self._past.u.shape[1:]
+        self._sampler = emcee.EnsembleSampler(walkers, d, log_probability, moves=moves(), vectorize=True)
+        position, has, kept = self._past.places
+        random = ("MT19937", self._past.keys, int(position), int(has), float(kept))
+        # before the first step a walk has one row, the start, which is no step
+        self._started = bool(np.isfinite(self._past.log_probability[-1]).all())
+        known = self._past.log_probability[-1] if self._started else None
+        self._state: Any = emcee.State(self._past.u[-1], log_prob=known, random_state=random)
+        self._done = 0
+
+    @property
+    def steps(self) -> int:
+        return (len(self._past.u) if self._started else 0) + self._done
+
+    def go(self, steps: int) -> None:
+        self._state = self._sampler.run_mcmc(self._state, steps, skip_initial_state_check=self.steps > 0)
+        self._done += steps
+
+    def walk(self) -> Walk:
+        """All steps, with a leading axis of one ensemble."""
+        past = self._past
+        if self._done == 0:
+            return Walk(*(getattr(past, f.name)[None] for f in fields(Walk)))
+        u, log_probability = self._sampler.get_chain(), self._sampler.get_log_prob()
+        accepted = self._sampler.backend.accepted
+        if self._started:
+            u, log_probability = np.concatenate((past.u, u)), np.concatenate((past.log_probability, log_probability))
+            accepted = past.accepted + accepted
+        _, keys, *places = self._sampler.random_state
+        return Walk(u[None], log_probability[None], accepted[None], np.asarray(keys)[None], np.array([places], dtype=float))
+
+
+def _fresh(start: Array, random: np.random.RandomState) -> Walk:
+    """A walk of one ensemble before its first step."""
+    state: Any = random.get_state()
+    _, keys, *places = state
+    none = np.full((1, 1, len(start)), np.nan)
+    return Walk(start[None, None], none, np.zeros((1, len(start))), keys[None], np.array([places], dtype=float))
+
+
+def _together(ensembles: Sequence[_Ensemble]) -> Walk:
+    parts = [ensemble.walk() for ensemble in ensembles]
+    return Walk(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Walk)))
 
 
 def _settle(chain: Array, rule: Rule) -> tuple[Array, int]:

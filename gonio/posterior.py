@@ -2,7 +2,8 @@ r"""Draws from a posterior, and their file: NetCDF in the layout of ArviZ.
 
 The file has the groups ``posterior`` (one variable per parameter, dimensions chain and draw) and ``sample_stats``
 (``lp``, the log density up to a constant), so ``arviz.from_netcdf`` and ``xarray.open_dataset(path, group="posterior")``
-read it; model, held parameters and diagnostics are attributes. A chain is one independent ensemble.
+read it; model, held parameters and diagnostics are attributes. A chain is one independent ensemble. A group ``walk`` is
+there if chains that have not converged can go on.
 
 This module draws nothing and judges nothing; it holds what `fitting` found. A file that is not a posterior, or holds a
 value that is not finite, is refused.
@@ -47,12 +48,14 @@ class Posterior:
     draws : ndarray, shape (chain, draw, len(names))
         In natural units, burn-in removed.
     log_probability : ndarray, shape (chain, draw)
-        Log posterior density at the draws, up to a constant.
+        Log posterior density of the draws in natural units, up to a constant.
     fixed : mapping of str to float
         Held parameters.
     diagnostics : mapping
-        converged, status, tau, ess, rhat, acceptance, chi2_per_n, n_samples, advice, ...; made JSON-compatible (infinity
-        and NaN become None).
+        method, converged, status, ess, rhat, acceptance, chi2_per_n, n_samples, advice, ...; made JSON-compatible
+        (infinity and NaN become None).
+    walk : mapping of str to ndarray, optional
+        All steps of chains that have not converged, and the state of their random numbers, for `fitting.fit` to go on with.
 
     Raises
     ------
@@ -66,6 +69,7 @@ class Posterior:
     log_probability: Array
     fixed: Mapping[str, float] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    walk: Mapping[str, NDArray[Any]] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "diagnostics", _plain(self.diagnostics))
@@ -164,6 +168,12 @@ class Posterior:
             file.attrs["diagnostics"] = json.dumps(self.diagnostics, sort_keys=True, allow_nan=False)
             self._write_group(file, "posterior", dict(zip(self.names, np.moveaxis(self.draws, 2, 0), strict=True)))
             self._write_group(file, "sample_stats", {"lp": self.log_probability})
+            if self.walk is not None:
+                group = file.create_group("walk")
+                for name, array in self.walk.items():
+                    group.dimensions.update({f"{name}_{i}": n for i, n in enumerate(array.shape)})
+                    axes = tuple(f"{name}_{i}" for i in range(array.ndim))
+                    group.create_variable(name, axes, data=array, compression="gzip", compression_opts=1, shuffle=True)
             units = self.diagnostics.get("units")
             for name, unit in units.items() if isinstance(units, Mapping) else ():
                 if name in self.names:
@@ -177,7 +187,7 @@ class Posterior:
         for key, value in variables.items():
             data = np.ascontiguousarray(value)
             group.create_variable(key, ("chain", "draw"), data=data, compression="gzip", compression_opts=1, shuffle=True)
-        group.attrs["inference_library"] = "emcee"
+        group.attrs["inference_library"] = str(self.diagnostics.get("method", "gonio"))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Posterior:
@@ -222,8 +232,12 @@ class Posterior:
         if math.prod(shape) * (len(names) + 1) > _LARGEST:
             raise DatasetError(f"{path}: {math.prod(shape) * (len(names) + 1)} numbers are more than {_LARGEST} allowed")
         draws = np.stack([np.asarray(variable[...], dtype=np.float64) for variable in variables], axis=2)
+        walk = {name: np.asarray(v[...]) for name, v in file["walk"].variables.items()} if "walk" in file.groups else None
+        if walk is not None and sum(array.size for array in walk.values()) > _LARGEST:
+            raise DatasetError(f"{path}: its chains hold more than {_LARGEST} numbers")
         fixed = {str(name): float(value) for name, value in fixed.items()}
-        return cls(str(file.attrs["model"]), tuple(names), draws, np.asarray(lp[...], dtype=np.float64), fixed, diagnostics)
+        log_probability = np.asarray(lp[...], dtype=np.float64)
+        return cls(str(file.attrs["model"]), tuple(names), draws, log_probability, fixed, diagnostics, walk)
 
 
 def _plain(value: Any) -> Any:

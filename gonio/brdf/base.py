@@ -123,6 +123,10 @@ class Model:
         parameter array, such as a table of albedos.
     derived_slopes : callable, optional
         Of the parameters (n,): derivatives of these numbers by each parameter (n, m). Without it they come from differences.
+    factors : tuple of str
+        Parameters to each of which f_r is proportional, the others held; a fit solves for those.
+    affine : tuple of str
+        Parameters of each of which f_r is ``a + b x``, the others held.
     array_function : callable, optional
         ``(omega_i (n, 3), omega_r (n, 3), p) -> (n,)`` for code that is not compiled; `function` is then None.
     diffuse : bool
@@ -149,6 +153,8 @@ class Model:
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None
     derived_slopes: Callable[[Array], Array] | None = None
+    factors: tuple[str, ...] = ()
+    affine: tuple[str, ...] = ()
     array_function: Callable[[Array, Array, Array], Array] | None = None
     shadowed: bool = True
     diffuse: bool = False
@@ -167,6 +173,9 @@ class Model:
         names = [parameter.name for parameter in self.parameters]
         if len(set(names)) != len(names):
             raise ParameterError(f"{self.name} has two parameters of one name among {', '.join(names)}; rename one")
+        for name in (*self.factors, *self.affine):
+            if name not in names:
+                raise ParameterError(f"{self.name} says that f_r is linear in {name!r}, which is none of its parameters")
 
     @property
     def expression(self) -> str:

@@ -23,4 +23,5 @@ LAMBERTIAN = Model(
     doc="f_r = albedo / pi.",
     reference="J. H. Lambert, Photometria, 1760",
     diffuse=True,
+    factors=("albedo",),
 )

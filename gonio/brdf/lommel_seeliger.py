@@ -43,6 +43,7 @@ LOMMEL_SEELIGER = Model(
     name="lommel_seeliger",
     parameters=(Parameter("w", 0.0, 1.0, "single-scattering albedo", ("uniform", 0.0, 1.0)),),
     function=lommel_seeliger_f_r,
+    factors=("w",),
     doc="w / (4 pi) / (cos theta_i + cos theta_r): single scattering in a deep layer.",
     reference="Seeliger, Sitzungsber. Akad. Wiss. Muenchen 18, 1888; Hapke, J. Geophys. Res. 86, 1981",
     lobe_width=_width,

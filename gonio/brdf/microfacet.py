@@ -162,6 +162,8 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
             *reflectance.parameters,
         ),
         function=_function(distribution, fresnel, shadowing, repeated),
+        factors=("k_s",),
+        affine=("f_0",) if fresnel == "schlick" and not repeated else (),
         doc=f"{facets.doc} facets, {hiding} shadowing, {reflectance.doc}"
         + (", and light scattered several times." if repeated else "."),
         reference="; ".join(

@@ -52,6 +52,7 @@ MINNAERT = Model(
         Parameter("k", 0.0, 2.0, "limb darkening; 1 is Lambert's surface", ("uniform", 0.0, 2.0)),
     ),
     function=minnaert_f_r,
+    factors=("albedo",),
     doc="albedo / pi (cos theta_i cos theta_r)^(k - 1); infinite at the horizon for k < 1.",
     reference="Minnaert, Astrophysical Journal 93, 1941",
     lobe_width=_width,

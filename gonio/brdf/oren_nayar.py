@@ -119,6 +119,7 @@ def _model(variant: str, function: Callable[..., float], doc: str) -> Model:
         reference="Oren & Nayar, SIGGRAPH 1994",
         kinks=kinks,
         energy_bounded=False,
+        factors=("albedo",) if variant == "qualitative" else (),
         choices={} if variant == "qualitative" else {"variant": variant},
     )
 

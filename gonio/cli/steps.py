@@ -135,8 +135,13 @@ def describe_convergence(posterior: Posterior) -> str:
         items = list(value.values()) if isinstance(value, Mapping) else np.atleast_1d(np.asarray(value, dtype=float))
         return f"{float(pick(items)):.4g}"
 
+    how = (
+        f"importance sampling with Pareto k = {max(float(d['k_hat'] or 0.0), 0.0):.2f}"
+        if "k_hat" in d
+        else f"autocorrelation time up to {worst('tau', max)}"
+    )
     text = (
-        f"{state}: autocorrelation time up to {worst('tau', max)}, effective sample size at least {worst('ess', min)}, "
+        f"{state}: {how}, effective sample size at least {worst('ess', min)}, "
         f"R-hat up to {worst('rhat', max)}; chi2/N = {worst('chi2_per_n', max)}"
     )
     advice = d.get("advice")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gonio.maps import ReflectanceMap
     from gonio.posterior import Posterior
 
-_SAMPLER = ("ensembles", "walkers", "steps", "burn_in", "thin", "seed")
+_SAMPLER = ("method", "proposals", "ensembles", "walkers", "steps", "burn_in", "thin", "seed")
 Array = NDArray[np.float64]
 Rows = list[tuple[str, Cell]]
 
@@ -97,7 +97,7 @@ def of_fit(posterior: Posterior) -> Rows:
     if held:
         rows.append(("held fixed", ", ".join(f"{name} = {value:g}" for name, value in held.items())))
     rows.append(("draws", f"{n_chain} independent chains of {n_draw}, burn-in removed"))
-    sampler = [f"{key.replace('_', '-')} {d[key]}" for key in _SAMPLER if isinstance(d.get(key), int)]
+    sampler = [f"{key.replace('_', '-')} {d[key]}" for key in _SAMPLER if isinstance(d.get(key), int | str)]
     if sampler:
         rows.append(("sampler", ", ".join(sampler)))
     converged = d.get("converged")
