@@ -21,7 +21,7 @@ from gonio.lock import FileLock, HeldError
 
 logger = logging.getLogger(__name__)
 
-READ_SLICE_S = 0.002
+READ_SLICE_S = 0.010
 """How long one read of a port waits for bytes [s]: long enough not to spin, short beside every timeout."""
 
 _PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")  # Linux, macOS

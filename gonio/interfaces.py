@@ -7,7 +7,7 @@ on a virtual one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
@@ -108,6 +108,26 @@ class Axis(Protocol):
 
     def describe(self) -> Mapping[str, object]:
         """Identity and settings for the run's metadata (JSON-compatible)."""
+        ...
+
+
+@runtime_checkable
+class AxisGroup(Protocol):
+    """The axes of a rig, asked and started together."""
+
+    def move_to(self, goals: Mapping[str, float]) -> None:
+        """Start moving axes, each to its angle [rad], at the same instant; returns at once.
+
+        Raises `LimitError` before a byte is sent.
+        """
+        ...
+
+    def settled(self, names: Collection[str]) -> Mapping[str, bool]:
+        """Poll these axes, each as `Axis.settled`."""
+        ...
+
+    def read(self) -> Mapping[str, AxisReading]:
+        """Measure all axes now."""
         ...
 
 

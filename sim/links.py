@@ -25,6 +25,7 @@ from gonio.errors import DeviceError
 from sim.clock import ScaledClock
 from sim.dynamixel.control_table import BAUD_RATES
 
+EARLY_S = 2e-4  # how far ahead of a due reply the pump wakes up, and then watches the clock: a timer alone is late by as much
 IDLE_S = 0.1  # wall time of silence after which servos forget an unfinished packet; they themselves wait 1.5 ms
 
 
@@ -32,7 +33,8 @@ class Device(Protocol):
     """What stands at the far end of a line."""
 
     def feed(self, data: bytes, t: float) -> list[tuple[float, bytes]]:
-        """Take bytes that arrived at rig time `t` [s]; return replies with their delays [s], in order."""
+        """Take bytes that arrived at rig time `t` [s]; return replies in order, each with its delay after what was on the
+        line before it: these bytes, or the reply ahead of it [s]."""
         ...
 
     def idle(self) -> None:
@@ -75,7 +77,8 @@ class Pump:
     """
 
     def __init__(self, *links: Link) -> None:
-        self._selector = selectors.DefaultSelector()
+        # Waits to the microsecond; epoll and poll round up to the millisecond, more than a packet takes at 4 Mbit/s.
+        self._selector = selectors.SelectSelector()
         self._links: list[Link] = []
         for link in links:
             self.add(link)
@@ -89,7 +92,7 @@ class Pump:
         """Wait for data or a due reply, at most `timeout` wall seconds, and serve it."""
         now = time.monotonic()
         dues = [due for link in self._links if (due := link.due()) is not None]
-        wait = max(0.0, min([timeout, *(due - now for due in dues)]))
+        wait = max(0.0, min([timeout, *(due - now - EARLY_S for due in dues)]))
         for key, _ in self._selector.select(wait):
             for new in key.data.on_readable():
                 self.add(new)
@@ -145,7 +148,8 @@ class _StreamLink:
         self._device = device
         self._clock = clock
         self._baud = baud
-        self._free = 0.0  # when the line has carried everything so far; 10 bits a byte
+        self._arrived = 0.0  # when the client's last byte is there; 10 bits a byte
+        self._free = 0.0  # when the last reply is out
         self._queue: deque[tuple[float, bytes]] = deque()
         self._unsent = b""
         self._retry = 0.0  # when to try again what the receiver did not take
@@ -163,17 +167,17 @@ class _StreamLink:
             self._unsent += self._queue.popleft()[1]
         self._flush()
 
-    def _receive(self, data: bytes) -> None:
-        now = time.monotonic()
+    def _receive(self, data: bytes, now: float) -> None:
+        """Take what the client has sent by `now` [s]."""
         if now - self._heard > IDLE_S:
             self._device.idle()
         self._heard = now
         speed = self._clock.speed
         byte_s = 10.0 / self._baud / speed if self._baud else 0.0
-        self._free = max(self._free, now) + len(data) * byte_s
-        for delay, reply in self._device.feed(data, self._clock.now() + (self._free - now) * speed):
-            last = self._queue[-1][0] if self._queue else now
-            self._free = max(last, self._free + delay / speed if self._baud else now + delay / speed) + len(reply) * byte_s
+        self._arrived = max(self._arrived, now) + len(data) * byte_s
+        self._free = max(self._free, self._arrived)
+        for delay, reply in self._device.feed(data, self._clock.now() + (self._arrived - now) * speed):
+            self._free += delay / speed + len(reply) * byte_s
             self._queue.append((self._free, reply))
         self.on_due()
 
@@ -192,8 +196,7 @@ def _line_rate(terminal: int) -> int | None:
     import termios
 
     speed = termios.tcgetattr(terminal)[5]
-    known = {getattr(termios, f"B{rate}", rate): rate for rate in BAUD_RATES}
-    return known.get(speed)
+    return next((rate for rate in BAUD_RATES if getattr(termios, f"B{rate}", rate) == speed), None)
 
 
 class PtyLink(_StreamLink):
@@ -252,6 +255,7 @@ class PtyLink(_StreamLink):
         return self._master
 
     def on_readable(self) -> Sequence[Link]:
+        now = time.monotonic()
         try:
             data = os.read(self._master, 65_536)
         except BlockingIOError:
@@ -265,7 +269,7 @@ class PtyLink(_StreamLink):
                 self._device.baudrate = rate
             if self._baud and rate:
                 self._baud = rate
-            self._receive(data)
+            self._receive(data, now)
         return ()
 
     def _write(self, data: bytes) -> int:
@@ -296,11 +300,12 @@ class _Connection(_StreamLink):
         return self._socket.fileno()
 
     def on_readable(self) -> Sequence[Link]:
+        now = time.monotonic()
         data = received(self._socket)
         if data is None:
             return ()
         if data:
-            self._receive(data)
+            self._receive(data, now)
         else:
             self.closed = True  # the pump closes it: until then no new client can get the same descriptor
         return ()

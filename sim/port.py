@@ -113,12 +113,12 @@ class SimulatedPort(SerialBase):  # type: ignore[misc]  # pyserial has no types
         if line.clock.now() - line.heard > GAP_S:
             line.device.idle()
         line.clock.sleep(len(sent) * byte_s)
-        now = line.heard = line.clock.now()
-        last = self._arriving[-1][0] if self._arriving else now
+        now = free = line.heard = line.clock.now()
+        if self._arriving:  # the line carries one reply after the other
+            free = max(free, self._arriving[-1][0])
         for delay, reply in line.device.feed(sent, now):
-            # The line carries one reply after the other.
-            last = max(last, now + delay) + len(reply) * byte_s
-            self._arriving.append((last, reply))
+            free += delay + len(reply) * byte_s
+            self._arriving.append((free, reply))
         return len(sent)
 
     def read(self, size: int = 1, /) -> bytes:

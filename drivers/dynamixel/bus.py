@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from dynamixel_sdk.robotis_def import INST_PING, INST_READ, INST_REBOOT, INST_SYNC_WRITE, INST_WRITE
@@ -177,6 +177,11 @@ class Bus:
         self._refuse(servo_id, f"{register.name} = {value}", error)
         return bool(error & 0x80)
 
+    def command(self, servo_id: int, register: Register, value: int) -> None:
+        """Write a register; `HardwareStatusError` if the servo then raises its alert bit."""
+        if self.write(servo_id, register, value):
+            raise self.hardware_fault(servo_id)
+
     def sync_write(self, register: Register, values: Mapping[int, int]) -> None:
         """Write one register of several servos at once. No servo answers: read back what matters."""
         parameters = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
@@ -231,9 +236,48 @@ class Bus:
             sent_s = self.clock.now()
 
         data, error = self._line.ask(servo_id, INST_READ, parameters, BLOCK_SIZE, hasty=hasty, started=started)
+        return self._decoded(servo_id, data, error, sent_s)
+
+    def _decoded(self, servo_id: int, data: bytes, error: int, sent_s: float) -> Block:
         received_s = self.clock.now()
         self._refuse(servo_id, "reading its state", error)
         return decode_block(data, alert=bool(error & 0x80), sent_s=sent_s, received_s=received_s)
+
+    def blocks(self, servo_ids: Sequence[int]) -> dict[int, Block]:
+        """States of several servos, by one sync read of all of them.
+
+        A servo whose answer is missing, damaged, out of turn or of another time is asked again by itself, as `block` does:
+        an error bears its name.
+
+        Raises
+        ------
+        DeviceError
+            If a servo refuses, or does not answer when it is asked by itself.
+        """
+        with self._line.lock:
+            found = self._states(servo_ids) if len(servo_ids) > 1 else {}
+            return {servo_id: found.get(servo_id) or self.block(servo_id) for servo_id in servo_ids}
+
+    def _states(self, servo_ids: Sequence[int]) -> dict[int, Block]:
+        """What a sync read brings and can be believed."""
+        found: dict[int, Block] = {}
+        sent_s = 0.0
+
+        def started() -> None:
+            nonlocal sent_s
+            sent_s = self.clock.now()
+
+        def believed(servo_id: int, data: bytes, error: int) -> bool:
+            state = self._decoded(servo_id, data, error, sent_s)
+            if not self._ticks.setdefault(servo_id, TickClock(state)).accepts(state):
+                logger.info("%s: a state of another time (tick %d)", self.label(servo_id), state.tick)
+                return False
+            self._last[servo_id] = state.position
+            found[servo_id] = state
+            return True
+
+        self._line.read_all(servo_ids, BLOCK_ADDRESS, BLOCK_SIZE, started=started, believed=believed)
+        return found
 
     def agreed_block(self, servo_id: int) -> Block:
         """The later of two consecutive blocks that agree: same goal, and no farther apart than a servo can turn."""
@@ -241,11 +285,7 @@ class Bus:
         tries = 2 * self._line.attempts
         for _ in range(tries):
             later = self.block(servo_id)
-            moved = abs(later.position - earlier.position)
-            turning = earlier.in_motion or later.in_motion
-            reach = _MOTION_SLACK_COUNTS
-            if turning:
-                reach += _TOP_SPEED_COUNTS_S * (later.received_s - earlier.sent_s)
+            moved, reach = _apart(earlier, later)
             if later.goal == earlier.goal and moved <= reach:
                 return later
             earlier = later
@@ -253,6 +293,18 @@ class Bus:
             f"{self.label(servo_id)}: {tries} pairs of readings in a row disagree, the last by "
             f"{moved} counts where {reach:.0f} are possible; check the cable, and that no two servos share an id."
         )
+
+    def agreed_blocks(self, servo_ids: Sequence[int]) -> dict[int, Block]:
+        """`agreed_block` of several servos, by two sync reads in a row; by itself where those do not agree."""
+        with self._line.lock:
+            earlier, later = self.blocks(servo_ids), self.blocks(servo_ids)
+            agreed: dict[int, Block] = {}
+            for servo_id in servo_ids:
+                first, second = earlier[servo_id], later[servo_id]
+                moved, reach = _apart(first, second)
+                agrees = second.goal == first.goal and moved <= reach
+                agreed[servo_id] = second if agrees else self.agreed_block(servo_id)
+            return agreed
 
     def hardware_fault(self, servo_id: int) -> HardwareStatusError:
         """What a servo that raises its alert bit says is wrong with it; to be raised by the caller."""
@@ -312,3 +364,11 @@ class Bus:
                 f"{', and it reports a hardware error' if error & 0x80 else ''}; "
                 "check its model, operating mode and limits in rig.toml."
             )
+
+
+def _apart(earlier: Block, later: Block) -> tuple[int, float]:
+    """How far apart two states of a servo are, and how far it can have turned in between [counts]."""
+    reach = _MOTION_SLACK_COUNTS
+    if earlier.in_motion or later.in_motion:
+        reach += _TOP_SPEED_COUNTS_S * (later.received_s - earlier.sent_s)
+    return abs(later.position - earlier.position), reach

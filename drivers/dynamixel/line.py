@@ -14,10 +14,17 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from dynamixel_sdk.robotis_def import BROADCAST_ID, COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, INST_READ
+from dynamixel_sdk.robotis_def import (
+    BROADCAST_ID,
+    COMM_RX_CORRUPT,
+    COMM_RX_TIMEOUT,
+    COMM_SUCCESS,
+    INST_READ,
+    INST_SYNC_READ,
+)
 
 from drivers.dynamixel.sdk import ERROR_AT, ID_AT, LENGTH_AT, PARAMETERS_AT, Packets, Port
 from drivers.serial_port import PortLostError, port_errors
@@ -114,6 +121,16 @@ class Line:
 
     def tell(self, instruction: int, parameters: bytes) -> None:
         """Broadcast an instruction that nobody answers."""
+        with self.lock:
+            try:
+                self._tell(instruction, parameters)
+            except PortLostError:
+                if not self._return_s:
+                    raise
+                self._come_back()
+                self._tell(instruction, parameters)
+
+    def _tell(self, instruction: int, parameters: bytes) -> None:
         with self._transaction():
             self._sent(self._packets.transmit(self._port, BROADCAST_ID, instruction, parameters))
 
@@ -174,6 +191,61 @@ class Line:
             self.failing.add(servo_id)
         raise self._silence(servo_id, result)
 
+    def read_all(
+        self,
+        servo_ids: Sequence[int],
+        address: int,
+        length: int,
+        *,
+        started: Callable[[], None],
+        believed: Callable[[int, bytes, int], bool],
+    ) -> None:
+        """One sync read: servos answer one instruction in turn. A single try, and only what is beyond doubt.
+
+        The first answer that is missing, damaged, of another servo, of another length or not believed ends it: nothing
+        that comes after is listened to, and every one of the servos is fenced before it is asked again. Nothing is asked
+        while one of them owes an answer. Ask those one by one that have not answered; that fences them, and names the
+        culprit.
+
+        Parameters
+        ----------
+        servo_ids : sequence of int
+            In the order in which they are to answer.
+        address, length : int
+            Of the registers.
+        started : callable
+            Called just before the question.
+        believed : callable
+            Called with servo id, data and error byte as each answer comes; False if it cannot be one to this question.
+        """
+        parameters = address.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(servo_ids)
+        with self.lock:
+            if self._owing & set(servo_ids):
+                return
+            self._port.timeout_s = self.timeout_s
+            try:
+                started()
+                with self._transaction():
+                    self._owing |= set(servo_ids)
+                    self._asked |= set(servo_ids)
+                    self._sent(self._packets.transmit(self._port, BROADCAST_ID, INST_SYNC_READ, parameters, length))
+                    for servo_id in servo_ids:
+                        packet, result = self._packets.rxPacket(self._port, False)
+                        status = self._status(packet, length) if result == COMM_SUCCESS else None
+                        if status is None or packet[ID_AT] != servo_id or status[1] & 0x7F == _STATUS_CRC:
+                            self.timeouts += 1
+                            logger.info("%s: no valid answer (%d) to a sync read", self._label(servo_id), result)
+                            return
+                        self._port.setPacketTimeout(length + 11)  # of the next one
+                        if not believed(servo_id, *status):
+                            return
+                    self._owing -= set(servo_ids)
+                    self.failing -= set(servo_ids)
+            except PortLostError:
+                if not self._return_s:
+                    raise
+                self._come_back()
+
     def _come_back(self) -> None:
         """Open the port again, as soon as it is there; then every servo may still owe an answer."""
         end_s = time.monotonic() + self._return_s
@@ -203,13 +275,20 @@ class Line:
                 packet, result = self._packets.rxPacket(self._port, False)
                 if result != COMM_SUCCESS:
                     return result, b"", 0
-                count = (packet[LENGTH_AT] | packet[LENGTH_AT + 1] << 8) - 4  # instruction, error, CRC
-                error = packet[ERROR_AT]
-                # a status with an error number carries no data
-                if packet[ID_AT] == servo_id and count == (0 if error & 0x7F else length):
+                status = self._status(packet, length)
+                if status is not None and packet[ID_AT] == servo_id:
                     self._owing.discard(servo_id)
-                    return result, bytes(packet[PARAMETERS_AT : PARAMETERS_AT + count]), error
+                    return result, *status
                 logger.info("port %s: passed over a stray answer of servo id %d", self.url, packet[ID_AT])
+
+    @staticmethod
+    def _status(packet: Sequence[int], length: int) -> tuple[bytes, int] | None:
+        """Data and error byte of a status packet; None if it is not the answer to a question for `length` bytes."""
+        count = (packet[LENGTH_AT] | packet[LENGTH_AT + 1] << 8) - 4  # instruction, error, CRC
+        error = packet[ERROR_AT]
+        if count != (0 if error & 0x7F else length):  # a status with an error number carries no data
+            return None
+        return bytes(packet[PARAMETERS_AT : PARAMETERS_AT + count]), error
 
     def _fence(self, servo_id: int) -> bool:
         """Drain; then True once the servo answers a question that no earlier one can have been."""

@@ -20,6 +20,7 @@ from drivers.dynamixel.bus import Bus
 from drivers.dynamixel.commissioning import Settings, commission
 from drivers.dynamixel.joint import Joint
 from drivers.dynamixel.leg import Leg, Outcome
+from drivers.dynamixel.watchdog import Watchdog
 from gonio.errors import ConfigurationError, DeviceError, LimitError, ProtocolError
 from gonio.interfaces import AxisLimits, AxisReading
 
@@ -95,7 +96,6 @@ class Servo:
         self._settle_s = settle_s
         self._stall_s = stall_s
         self._check_parameters(model, acceleration, watchdog_s)
-        self._watchdog = 0 if watchdog_s is None else max(1, round(watchdog_s / reg.WATCHDOG_UNIT_S))
         self._settings = Settings(
             reg.MODELS[model],
             self._joint.low_counts,
@@ -103,6 +103,7 @@ class Servo:
             max(1, int(velocity / reg.VELOCITY_UNIT)),
             max(1, int(acceleration / reg.ACCELERATION_UNIT)),
         )
+        self._watchdog = Watchdog(bus, servo_id, self._settings, watchdog_s)
         self._connected = False
         self._identity: dict[str, object] = {}
         self._goal: int | None = None  # of the move [counts]; None when the axis only holds
@@ -170,9 +171,9 @@ class Servo:
         if holds and not present.in_motion:
             goal = present.goal  # a new one would only move it
         if present.goal != goal:
-            self._write(reg.GOAL_POSITION, goal)
+            self._send_goal(goal)
         if not holds:
-            self._write(reg.TORQUE_ENABLE, 1)
+            self._bus.command(self._id, reg.TORQUE_ENABLE, 1)
             if not self._read(reg.TORQUE_ENABLE):
                 raise DeviceError(f"{self._label} does not switch its torque on; power-cycle it and retry.")
         self.halted(self._bus.block(self._id).goal)
@@ -204,20 +205,10 @@ class Servo:
         LimitError
             Outside the limits; nothing was sent.
         """
-        goal = self._joint.goal(angle)
-        self._need_connection()
-        again = goal == self._goal
-        if again and not (self._arrived and self._joint.approach != "any"):  # under way, or there
-            return
-        present = self._healthy(self._bus.block(self._id)).position
-        legs, self._one_sided = self._joint.legs(present, goal, engaged=self._engaged and self._arrived and not again)
-        if not self._one_sided:
-            logger.warning("axis %s: no room to approach %.2f deg from one side", self.name, self._joint.degrees(goal))
-        if self._watchdog:
-            self._disarm()
-            self._write(reg.BUS_WATCHDOG, self._watchdog)
-        self._begin(legs)
-        self._write(reg.GOAL_POSITION, legs[0])
+        if self.departs(angle):
+            block = self._bus.block(self._id)
+            self.arm(block)
+            self._send_goal(self.depart(angle, block))
 
     def _begin(self, legs: list[int]) -> None:
         self._legs = legs
@@ -241,7 +232,46 @@ class Servo:
             Hardware error, stall, lost torque, no answer.
         """
         self._need_connection()
-        block = self._healthy(self._bus.block(self._id))
+        return self.judge(self._bus.block(self._id))
+
+    def read(self) -> AxisReading:
+        """Measure now: two consecutive consistent blocks.
+
+        Raises
+        ------
+        HardwareStatusError
+            The servo reports an error of its own.
+        """
+        self._need_connection()
+        return self.reading(self._bus.agreed_block(self._id))
+
+    # -- the same in steps, for several servos whose states are asked and whose goals are sent in one packet
+
+    def departs(self, angle: float) -> bool:
+        """Whether a goal has to be sent to get to `angle` [rad]: not if it is under way there, nor if it stands there
+        and would not be approached anew. `LimitError` outside the limits."""
+        goal = self._joint.goal(angle)
+        self._need_connection()
+        return goal != self._goal or (self._arrived and self._joint.approach != "any")
+
+    def arm(self, block: reg.Block) -> None:
+        """Watchdog on, if the servo's state says that it is healthy."""
+        self._healthy(block)
+        self._watchdog.arm()
+
+    def depart(self, angle: float, block: reg.Block) -> int:
+        """Begin a move from the state that was read; returns the first goal, which the caller sends [counts]."""
+        goal = self._joint.goal(angle)
+        engaged = self._engaged and self._arrived and goal != self._goal
+        legs, self._one_sided = self._joint.legs(block.position, goal, engaged=engaged)
+        if not self._one_sided:
+            logger.warning("axis %s: no room to approach %.2f deg from one side", self.name, self._joint.degrees(goal))
+        self._begin(legs)
+        return legs[0]
+
+    def judge(self, block: reg.Block) -> bool:
+        """What `settled` says of a state that was read now; sends the next goal of an approach."""
+        self._healthy(block)
         if block.goal != self._legs[0]:
             self._resend(block)
             return False
@@ -261,23 +291,12 @@ class Servo:
         if len(self._legs) > 1:
             del self._legs[0]
             self._start_leg()
-            self._write(reg.GOAL_POSITION, self._legs[0])
+            self._send_goal(self._legs[0])
             return False
         self._arrived = True
         self._engaged = self._one_sided
-        if self._watchdog:
-            self._disarm()
+        self._watchdog.disarm()
         return True
-
-    def _disarm(self) -> None:
-        """Watchdog off. One that has tripped takes the profile with it: without it the next move would be a jerk."""
-        if self._read(reg.BUS_WATCHDOG) < 0:
-            logger.warning("axis %s: the servo's watchdog had tripped", self.name)
-            self._write(reg.BUS_WATCHDOG, 0)
-            self._write(reg.PROFILE_ACCELERATION, self._settings.profile_acceleration)
-            self._write(reg.PROFILE_VELOCITY, self._settings.profile_velocity)
-        else:
-            self._write(reg.BUS_WATCHDOG, 0)
 
     def _resend(self, block: reg.Block) -> None:
         """The servo holds another goal than the one it acknowledged."""
@@ -293,16 +312,16 @@ class Servo:
             )
         self._resends += 1
         logger.warning("axis %s: goal %d instead of %d, sent again", self.name, block.goal, self._legs[0])
-        self._write(reg.GOAL_POSITION, self._legs[0])
+        self._send_goal(self._legs[0])
 
     def _give_up(self, block: reg.Block) -> None:
         """No progress: let go of the load, say what was seen."""
         goal = self._legs[0]
-        tripped = bool(self._watchdog) and self._read(reg.BUS_WATCHDOG) == -1
+        tripped = self._watchdog.tripped()
         current = self._current_a(block)
         try:
             if tripped:  # it takes no goal before
-                self._disarm()
+                self._watchdog.disarm()
             self.stop()
         except DeviceError as error:
             logger.warning("axis %s: cannot be stopped after its stall: %s", self.name, error)
@@ -317,16 +336,9 @@ class Servo:
             f"{load}, its goal is {self._at(goal)}; look for an obstacle, too heavy a load or a low supply."
         )
 
-    def read(self) -> AxisReading:
-        """Measure now: two consecutive consistent blocks.
-
-        Raises
-        ------
-        HardwareStatusError
-            The servo reports an error of its own.
-        """
-        self._need_connection()
-        block = self._healthy(self._bus.agreed_block(self._id))
+    def reading(self, block: reg.Block) -> AxisReading:
+        """The measurement that a state is."""
+        self._healthy(block)
         return AxisReading(
             angle=self._joint.angle(block.position),
             position_counts=block.position,
@@ -360,13 +372,13 @@ class Servo:
             "overshoot_counts": self._joint.overshoot_counts,
             "tolerance_counts": self._joint.tolerance_counts,
             "settle_s": self._settle_s,
-            "watchdog_s": self._watchdog * reg.WATCHDOG_UNIT_S,
+            "watchdog_s": self._watchdog.seconds,
         }
 
     def close(self) -> None:
         """Let go of the servo; it keeps its torque and holds."""
-        if self._connected and self._watchdog:
-            self._disarm()
+        if self._connected:
+            self._watchdog.disarm()
         self._connected = False
 
     # -- drivers.dynamixel.bus.Member
@@ -397,14 +409,12 @@ class Servo:
     def _read(self, register: reg.Register) -> int:
         return self._bus.read(self._id, register)
 
-    def _write(self, register: reg.Register, value: int) -> None:
-        if self._bus.write(self._id, register, value):
-            raise self._bus.hardware_fault(self._id)
+    def _send_goal(self, counts: int) -> None:
+        self._bus.command(self._id, reg.GOAL_POSITION, counts)
 
-    def _healthy(self, block: reg.Block) -> reg.Block:
+    def _healthy(self, block: reg.Block) -> None:
         if block.alert:
             raise self._bus.hardware_fault(self._id)
-        return block
 
     def _need_connection(self) -> None:
         if not self._connected:

@@ -37,7 +37,7 @@ def moving(rig_file: Path) -> Iterator[tuple[OpenAxes, Motion, Interrupts]]:
     config = load_rig(rig_file)
     with interrupts() as stop, open_axes(config) as opened:
         again = "give the command again to go on"
-        motion = Motion(opened.axes, opened.clock, config, lambda: stop.check(again), again)
+        motion = Motion(opened.group, opened.clock, config, lambda: stop.check(again), again)
         try:
             yield opened, motion, stop
         except BaseException:
@@ -133,8 +133,7 @@ def _jog(opened: OpenAxes, motion: Motion, key: Callable[[float], str], interrup
     while True:
         interrupt.check("start jog again to go on")
         here = {name: reading.angle for name, reading in motion.read().items()}
-        for name in names:
-            opened.axes[name].settled()  # drives the last leg of an approach
+        opened.group.settled(names)  # drives the last leg of an approach
         angles = "  ".join(f"{'>' if n == axis else ' '}{n} {math.degrees(a):8.2f}" for n, a in here.items())
         click.echo(f"\r{angles}   step {_STEPS_DEG[step]:g} deg  {told}\x1b[K", nl=False)
         pressed = key(0.1)

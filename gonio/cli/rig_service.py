@@ -115,8 +115,7 @@ def watch(rig_file: Path, count: int | None, interval_s: float) -> None:
 
 def _line(rig: Rig, number: int) -> str:
     parts = []
-    for name, axis in rig.axes.items():
-        now = axis.read()
+    for name, now in rig.group.read().items():
         current = "" if math.isnan(now.current_a) else f" {now.current_a:.2f} A"
         parts.append(f"{name} {math.degrees(now.angle):.2f} deg{current} {now.temperature_c:.0f} C {now.voltage_v:.1f} V")
     about: Any = rig.lamp.describe()

@@ -26,10 +26,10 @@ from typing import TYPE_CHECKING, Any
 from gonio.config import AxisConfig, CameraConfig, RigConfig, SimConfig
 from gonio.config.rig import CAMERA_PLUGINS
 from gonio.errors import ConfigurationError, DeviceError, DeviceTimeoutError, GonioError
-from gonio.interfaces import Axis, Camera, Clock, Lamp
+from gonio.interfaces import Axis, AxisGroup, Camera, Clock, Lamp
 
 if TYPE_CHECKING:
-    from drivers.dynamixel import Bus, Servo
+    from drivers.dynamixel import Bus, Servo, ServoGroup
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +66,8 @@ class Rig:
     clock : Clock
     axes : dict of str to Axis
         ``"arm"``, ``"pan"``, ``"tilt"``.
+    group : AxisGroup
+        The same, together.
     camera : Camera or None
     lamp : Lamp
     simulator_pid : int or None
@@ -73,13 +75,14 @@ class Rig:
     """
 
     def __init__(
-        self, config: RigConfig, clock: Clock, bus: Bus, axes: Mapping[str, Axis], camera: Camera | None, lamp: Lamp,
+        self, config: RigConfig, clock: Clock, bus: Bus, axes: Mapping[str, Servo], camera: Camera | None, lamp: Lamp,
         mount: Callable[[str], None], truth: Callable[[], Mapping[str, Any] | None],
         simulator_pid: int | None = None,
     ) -> None:  # fmt: skip
         self.config = config
         self.clock = clock
-        self.axes = dict(axes)
+        self.axes: dict[str, Axis] = dict(axes)
+        self.group: AxisGroup = _together(bus, axes)
         self.camera = camera
         self.lamp = lamp
         self.simulator_pid = simulator_pid
@@ -164,12 +167,15 @@ class OpenAxes:
     clock : Clock
     bus : Bus
     axes : dict of str to Servo
+    group : ServoGroup
+        The same, together.
     """
 
     config: RigConfig
     clock: Clock
     bus: Bus
     axes: dict[str, Servo]
+    group: ServoGroup
 
 
 @contextmanager
@@ -207,7 +213,7 @@ def open_axes(config: RigConfig, *, connect: bool = True) -> Iterator[OpenAxes]:
             stack.callback(_quietly, servo.close)
             if connect:
                 servo.connect()
-        yield OpenAxes(config, clock, bus, servos)
+        yield OpenAxes(config, clock, bus, servos, _together(bus, servos))
 
 
 def serve_simulator(arguments: Sequence[str], announce: Callable[[str], None] | None = None) -> int:
@@ -290,7 +296,7 @@ def _plugged_in(config: CameraConfig, clock: Clock) -> Camera:
     return camera
 
 
-def _connect(bus: Bus, config: RigConfig, stack: ExitStack, *, watchdog_s: float | None = None) -> dict[str, Axis]:
+def _connect(bus: Bus, config: RigConfig, stack: ExitStack, *, watchdog_s: float | None = None) -> dict[str, Servo]:
     """Open the bus and connect all axes."""
     stack.callback(bus.close)
     bus.open()
@@ -298,7 +304,13 @@ def _connect(bus: Bus, config: RigConfig, stack: ExitStack, *, watchdog_s: float
     for servo in servos.values():
         stack.callback(_quietly, servo.close)
         servo.connect()
-    return dict(servos)
+    return servos
+
+
+def _together(bus: Bus, servos: Mapping[str, Servo]) -> ServoGroup:
+    from drivers.dynamixel import ServoGroup
+
+    return ServoGroup(bus, servos)
 
 
 def servo_of(bus: Bus, axis: AxisConfig, watchdog_s: float | None) -> Servo:

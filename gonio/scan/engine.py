@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import gonio
 from gonio.errors import ConfigurationError, DatasetError, DeviceError, MeasurementError
-from gonio.interfaces import Axis, Camera, Clock, Frame, Lamp, StreamingCamera
+from gonio.interfaces import AxisGroup, Camera, Clock, Frame, Lamp, StreamingCamera
 from gonio.scan import preflight
 from gonio.scan.exposure import Exposer
 from gonio.scan.interrupt import Interrupts, interrupts
@@ -39,7 +39,7 @@ class ScanRig(Protocol):
     """What the engine needs of a rig (see `gonio.rig.Rig`)."""
 
     @property
-    def axes(self) -> Mapping[str, Axis]: ...
+    def group(self) -> AxisGroup: ...
 
     @property
     def camera(self) -> Camera | None: ...
@@ -132,7 +132,7 @@ class _Scan:
         if rig.camera is None:
             raise ConfigurationError('[camera] kind = "none": a scan needs a camera; choose one in rig.toml')
         self._exposer = Exposer(rig.camera, self._checked.exposures_s, self._config.camera.roi, check_stop)
-        self._motion = Motion(rig.axes, rig.clock, self._config, check_stop, advice)
+        self._motion = Motion(rig.group, rig.clock, self._config, check_stop, advice)
         past = [p.time_s for p in run.poses()] + [b.time_s for kind in ("dark", "white") for b in run.blocks(kind)]
         self._start_s = rig.clock.now()
         self._offset_s = max(past, default=0.0) - self._start_s

@@ -11,7 +11,7 @@ import numpy as np
 
 from gonio.config import RigConfig
 from gonio.errors import DeviceTimeoutError, MeasurementError
-from gonio.interfaces import Axis, AxisReading, Clock
+from gonio.interfaces import AxisGroup, AxisReading, Clock
 from gonio.scan import zones
 from gonio.scan.plan import AXES, move_seconds
 
@@ -29,7 +29,7 @@ class Motion:
 
     Parameters
     ----------
-    axes : mapping of str to Axis
+    axes : AxisGroup
     clock : Clock
     config : RigConfig
     check_stop : callable
@@ -39,7 +39,7 @@ class Motion:
     """
 
     def __init__(
-        self, axes: Mapping[str, Axis], clock: Clock, config: RigConfig, check_stop: Callable[[], None], advice: str
+        self, axes: AxisGroup, clock: Clock, config: RigConfig, check_stop: Callable[[], None], advice: str
     ) -> None:
         self._axes = axes
         self._clock = clock
@@ -75,12 +75,11 @@ class Motion:
         start, end = ([angles[axis] for axis in AXES] for angles in (here, {**here, **goal}))
         expected_s = float(move_seconds(start, end, self._config.axes))
         limit_s = _PATIENCE * expected_s + _GRACE_S
-        for axis in goal:
-            self._check_stop()
-            self._axes[axis].move_to(goal[axis])
+        self._check_stop()
+        self._axes.move_to(goal)
         deadline_s = self._clock.now() + limit_s
         pending, polls = list(goal), 0
-        while pending := [axis for axis in pending if not self._axes[axis].settled()]:
+        while pending := [axis for axis, settled in self._axes.settled(pending).items() if not settled]:
             polls += 1
             if self._clock.now() > deadline_s and polls > _LEAST_POLLS:
                 standing = self.read()
@@ -97,7 +96,7 @@ class Motion:
 
     def read(self) -> dict[str, AxisReading]:
         """Measure all axes."""
-        return {axis: self._axes[axis].read() for axis in AXES}
+        return dict(self._axes.read())
 
     def has_moved(self, before: Mapping[str, AxisReading], after: Mapping[str, AxisReading]) -> bool:
         """Whether an axis moved between two readings, by more than the rig allows, or still does."""

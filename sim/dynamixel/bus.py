@@ -29,7 +29,7 @@ from sim.dynamixel.packet import (
 )
 from sim.dynamixel.servo import Refused, Servo
 
-Reply = tuple[float, bytes]  # seconds after the instruction's last byte, and the bytes
+Reply = tuple[float, bytes]  # seconds after the last byte of what was on the line before it, and the bytes
 
 _LEVEL_READ, _LEVEL_ALL = 1, 2
 _RESETS_ALL_BEFORE = 42  # firmware that obeys a factory reset of everything by broadcast
@@ -169,7 +169,7 @@ class DynamixelBus:
             if fault.kind in OF_REPLIES and self._due(k, servo, fault.at_reply, counts.replies):
                 sent = [spoilt for reply in sent for spoilt in fault.spoil(reply, counts.replies)]
                 delay += fault.delay_s
-        return [(delay, reply) for reply in sent if reply]
+        return [(0.0 if k else delay, reply) for k, reply in enumerate(sent) if reply]
 
     # ---- instructions ------------------------------------------------------------------------------------------
 
@@ -270,13 +270,11 @@ class DynamixelBus:
     def _broadcast(self, packet: Packet, t: float) -> list[Reply]:
         """Everybody executes and nobody answers, but to a ping."""
         replies: list[Reply] = []
-        delay = 0.0
         for servo in sorted(self.servos, key=lambda servo: servo.id):
             if not self._hears(servo, t):
                 continue
             if packet.instruction == Instruction.PING:
-                delay += servo.return_delay_s
-                replies += self._send(servo, delay, self._status(servo, 0, self._identity(servo)))
+                replies += self._send(servo, servo.return_delay_s, self._status(servo, 0, self._identity(servo)))
             elif packet.instruction == Instruction.REBOOT:
                 servo.reboot(t)
             elif packet.instruction == Instruction.FACTORY_RESET and packet.params in (b"\x01", b"\x02", b"\xff"):
@@ -311,15 +309,13 @@ class DynamixelBus:
     def _reads(self, items: list[tuple[int, int, int]], t: float) -> list[Reply]:
         """Servos answer in turn, each after the one before it; one that is missing silences the rest."""
         replies: list[Reply] = []
-        delay = 0.0
         hearing = {id for id, _, _ in items if any(s.id == id and self._hears(s, t) for s in self.servos)}
         for id, address, length in items:
             if id not in hearing or self.servo(id).status_return_level < _LEVEL_READ:
                 break
             servo = self.servo(id)
             error, data = self._read_part(servo, address, length, t)
-            delay += servo.return_delay_s
-            replies += self._send(servo, delay, self._status(servo, error, data))
+            replies += self._send(servo, servo.return_delay_s, self._status(servo, error, data))
         return replies
 
     def _read_part(self, servo: Servo, address: int, length: int, t: float) -> tuple[int, bytes]:

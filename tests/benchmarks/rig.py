@@ -53,16 +53,15 @@ def _scan(poses: int) -> tuple[float, float]:
     arm, pan, tilt = (np.linspace(-0.9, 0.9, n) for n in (20, 20, 5))
     snake = [(a, b if i % 2 == 0 else -b, c) for c in tilt for i, a in enumerate(arm) for b in pan]
     with open_rig(parse_rig(text)) as rig:
-        axes = list(rig.axes.values())
-        low, high = (np.array([getattr(axis.limits, end) for axis in axes]) for end in ("lower", "upper"))
+        low, high = (np.array([getattr(axis.limits, end) for axis in rig.axes.values()]) for end in ("lower", "upper"))
         began, start = time.process_time(), rig.clock.now()
         for place in snake[:poses]:
-            for axis, angle in zip(axes, 0.5 * (low + high) + 0.5 * (high - low) * place, strict=True):
-                axis.move_to(float(angle))
-            waiting = list(axes)
+            angles = 0.5 * (low + high) + 0.5 * (high - low) * place
+            rig.group.move_to(dict(zip(rig.axes, angles.tolist(), strict=True)))
+            waiting = list(rig.axes)
             while waiting:
                 rig.clock.sleep(0.02)
-                waiting = [axis for axis in waiting if not axis.settled()]
+                waiting = [name for name, settled in rig.group.settled(waiting).items() if not settled]
         return time.process_time() - began, rig.clock.now() - start
 
 
