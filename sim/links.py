@@ -25,7 +25,7 @@ from gonio.errors import DeviceError
 from sim.clock import ScaledClock
 from sim.dynamixel.control_table import BAUD_RATES
 
-EARLY_S = 2e-4  # how far ahead of a due reply the pump wakes up, and then watches the clock: a timer alone is late by as much
+EARLY_S = 2e-4  # how far ahead of a due reply the pump wakes up, to watch the clock: a timer alone is late by as much
 IDLE_S = 0.1  # wall time of silence after which servos forget an unfinished packet; they themselves wait 1.5 ms
 
 

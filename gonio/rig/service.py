@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _HOLDER_S = 10.0  # for a process that was asked to stop to let go of the port
 _STEP_S = 0.05
+_SWITCH_S = 0.1  # for a rate to be on the line, and in the servo
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,7 @@ def apply(config: RigConfig, make: BusAt, changes: Sequence[Change]) -> None:
             if "Baud Rate" in own:
                 baud = config.bus.baud
                 bus.sync_write(reg.BAUD_RATE, {new_id: own["Baud Rate"].new})
+                time.sleep(_SWITCH_S)
         with make(baud) as bus:
             number, _ = bus.ping(new_id)
             if number != servo.number:

@@ -2,7 +2,8 @@
 
 Sections: kernels (ns per evaluation against C), models (the same for every model, and what it takes to compile all), targets
 (the maps that gonio promises), accuracy (run time against error, gonio and its peers), size (cost against the size of the
-map), start (of the command line), band (of a posterior), rig (the simulator: motion of a scan, a frame).
+map), start (of the command line), band (of a posterior), rig (the simulator: motion of a scan, a frame), bus (a cycle on the
+servos' line against its bytes alone).
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from __future__ import annotations
 import argparse
 import time
 
-from tests.benchmarks import accuracy, band, kernels, models, page, rig, size, start, targets
+from tests.benchmarks import accuracy, band, bus, kernels, models, page, rig, size, start, targets
 
-SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig")
+SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig", "bus")
 INTRODUCTION = """# Benchmarks
 
 What a reflectance map costs, beside what it costs a user who picks something else.
@@ -87,6 +88,8 @@ def main() -> None:
         tell("band", page.bands([band.measure(l, quick=given.quick) for l in band.LIGHTS]))
     if "rig" in chosen:
         tell("rig", rig.report(rig.measure(quick=given.quick)))
+    if "bus" in chosen:
+        tell("bus", bus.report(bus.measure(quick=given.quick)))
     if started is not None and found and results:
         tell("verdicts", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
     if whole:

@@ -25,7 +25,7 @@ PICTURE = "images/benchmark.png"
 TITLES = {
     "verdicts": "Promises", "accuracy": "Run time against error", "targets": "Maps that gonio promises",
     "size": "Size of the map", "kernels": "One evaluation", "models": "Every model", "start": "Start",
-    "band": "Band of a posterior", "rig": "Simulated rig",
+    "band": "Band of a posterior", "rig": "Simulated rig", "bus": "Servo line",
 }  # fmt: skip
 Row = Sequence[str]
 
