@@ -159,8 +159,8 @@ def report(found: Line) -> str:
     priority = "at real-time priority" if found.hurried else "at ordinary priority, so what else the machine did counts"
     return (
         "Goals of three axes out by a sync write, their states in by a sync read: median of the cycles, against the bytes' "
-        f"own time. Limits: {LIMIT_MS:g} ms above it; at {BAUDS[0]} bit/s a ratio of {LIMIT_RATIO:g}; {100 * LIMIT_WAITING:g} % "
-        f"of a processor while waiting for an answer. Taken {priority}.\n\n"
+        f"own time. Limits: {LIMIT_MS:g} ms above it; at {BAUDS[0]} bit/s a ratio of {LIMIT_RATIO:g}; "
+        f"{100 * LIMIT_WAITING:g} % of a processor while waiting for an answer. Taken {priority}.\n\n"
         "| rate [bit/s] | return delay | wire [ms] | cycle [ms] | above [ms] | ratio | axis by axis [ms] | processor "
         "| waiting |  |\n"
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n" + "".join(rows)
