@@ -1,48 +1,28 @@
 """Bringing a servo into service: is it the right one, is it healthy, does it hold the axis's settings?
 
 What is already right is not written again. EEPROM takes a write only while torque is off, so torque goes off, for a
-moment and with a warning in the log, if and only if a setting there has to change. It moves nothing and leaves torque
-as it found it, or off.
+moment and with a warning in the log, if and only if a setting there has to change. `torque_on` then gives it back. It
+moves nothing.
 
-References: ROBOTIS e-manual, XM430-W350, sections on Drive Mode, Operating Mode and Position Limits
+References: ROBOTIS e-manual, XM430-W350, sections on Drive Mode, Operating Mode, PWM, Current, Velocity and Position Limit
 (emanual.robotis.com/docs/en/dxl/x/xm430-w350).
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 
 from drivers.dynamixel import registers as reg
 from drivers.dynamixel.bus import Bus
-from gonio.errors import DeviceError, HardwareStatusError
+from drivers.dynamixel.joint import Joint
+from drivers.dynamixel.settings import Settings
+from gonio.errors import DeviceError, HardwareStatusError, LimitError
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a servo is to hold, in its own units.
-
-    Attributes
-    ----------
-    model : ServoModel
-        That it must be.
-    low, high : int
-        Position limits [counts].
-    profile_velocity, profile_acceleration : int
-        Registers 112 and 108; 0 would mean unlimited.
-    """
-
-    model: reg.ServoModel
-    low: int
-    high: int
-    profile_velocity: int
-    profile_acceleration: int
-
-
 def commission(bus: Bus, servo_id: int, settings: Settings) -> dict[str, object]:
-    """Check the servo, give it the settings, and return its identity (JSON-compatible).
+    """Check the servo, give it the settings, and return its identity (JSON-compatible); torque stays, or is off.
 
     Raises
     ------
@@ -59,9 +39,41 @@ def commission(bus: Bus, servo_id: int, settings: Settings) -> dict[str, object]
         reg.PROFILE_VELOCITY: settings.profile_velocity,
     }
     _write_checked(bus, servo_id, profile, "lower the axis's velocity")
+    if settings.pwm_limit is not None:
+        _write_checked(bus, servo_id, {reg.GOAL_PWM: settings.pwm_limit}, "power-cycle it and retry")
     for register in (reg.HOMING_OFFSET, reg.POSITION_P_GAIN, reg.POSITION_I_GAIN, reg.POSITION_D_GAIN):
         identity[register.name.lower().replace(" ", "_")] = bus.read(servo_id, register)
     return identity
+
+
+def torque_on(bus: Bus, servo_id: int, joint: Joint) -> int:
+    """Torque on without a jump; returns the goal at which the servo holds [counts].
+
+    Raises
+    ------
+    LimitError
+        If it stands outside the joint's limits.
+    DeviceError
+        If the torque stays off.
+    """
+    present = bus.agreed_block(servo_id)
+    holds = bool(bus.read(servo_id, reg.TORQUE_ENABLE))
+    goal = joint.clip(present.position)
+    if abs(goal - present.position) > joint.tolerance_counts:
+        raise LimitError(
+            f"{bus.label(servo_id)} stands at {joint.degrees(present.position):.2f} deg, outside its limits of "
+            f"{joint.limits_text}; {'switch its torque off and ' if holds else ''}turn it into them by hand, "
+            "or correct the limits."
+        )
+    if holds and not present.in_motion:
+        goal = present.goal  # a new one would only move it
+    if present.goal != goal:
+        bus.command(servo_id, reg.GOAL_POSITION, goal)
+    if not holds:
+        bus.command(servo_id, reg.TORQUE_ENABLE, 1)
+        if not bus.read(servo_id, reg.TORQUE_ENABLE):
+            raise DeviceError(f"{bus.label(servo_id)} does not switch its torque on; power-cycle it and retry.")
+    return bus.block(servo_id).goal
 
 
 def _identify(bus: Bus, servo_id: int, model: reg.ServoModel) -> dict[str, object]:
@@ -107,7 +119,12 @@ def eeprom_changes(bus: Bus, servo_id: int, settings: Settings) -> dict[reg.Regi
         reg.OPERATING_MODE: reg.POSITION_MODE,  # the mode in which the servo itself keeps to its limits
         reg.MAX_POSITION_LIMIT: settings.high,
         reg.MIN_POSITION_LIMIT: settings.low,
+        reg.VELOCITY_LIMIT: settings.profile_velocity,
     }
+    if settings.current_limit is not None:
+        wanted[reg.CURRENT_LIMIT] = settings.current_limit
+    if settings.pwm_limit is not None:
+        wanted[reg.PWM_LIMIT] = settings.pwm_limit
     found = {register: bus.read(servo_id, register) for register in wanted}
     return {register: (found[register], value) for register, value in wanted.items() if found[register] != value}
 

@@ -1,4 +1,4 @@
-"""One leg of a move, as its readings tell it: under way, at rest at its goal, or stuck.
+"""One leg of a move, as its readings tell it: under way, at rest at its goal, stuck, or with too much current.
 
 Pure bookkeeping over state blocks; it reads and sends nothing and knows no angle.
 """
@@ -13,6 +13,7 @@ from drivers.dynamixel.registers import Block
 
 _PROGRESS_COUNTS = 2
 _STALL_POLLS = 3  # a busy computer that polls late has seen no stall
+_STRAIN_S = 0.2  # the current of a start is over by then
 
 
 class Outcome(enum.Enum):
@@ -21,6 +22,7 @@ class Outcome(enum.Enum):
     UNDER_WAY = enum.auto()
     AT_REST = enum.auto()
     STALLED = enum.auto()
+    STRAINED = enum.auto()
 
 
 @dataclass
@@ -37,6 +39,8 @@ class Leg:
         Two equal readings so far apart are rest; so long without progress is a stall [s, rig time].
     start_s : float
         Rig time now [s].
+    current_limit : int or None
+        More current than this, on and on, is too much [the model's unit].
     """
 
     goal: int
@@ -44,6 +48,7 @@ class Leg:
     settle_s: float
     stall_s: float
     start_s: float
+    current_limit: int | None = None
 
     def __post_init__(self) -> None:
         self._rest: Block | None = None  # first of the equal readings
@@ -51,6 +56,8 @@ class Leg:
         self._best = math.inf  # smallest distance so far [counts]
         self._best_s = self.start_s
         self._polls = 0
+        self._strained: Block | None = None  # first of the readings with too much current
+        self._strained_polls = 0
 
     def still(self, block: Block) -> bool:
         """Within the tolerance, the shaft stands, no profile runs. One reading alone proves no rest."""
@@ -59,6 +66,8 @@ class Leg:
 
     def see(self, block: Block) -> Outcome:
         """Take one reading."""
+        if self._strains(block):
+            return Outcome.STRAINED
         still = self.still(block)
         if not still or self._rest is None or block.position != self._rest.position:
             self._rest = block if still else None
@@ -72,3 +81,11 @@ class Leg:
         if self._polls > _STALL_POLLS and block.received_s - self._best_s > self.stall_s:
             return Outcome.STALLED
         return Outcome.UNDER_WAY
+
+    def _strains(self, block: Block) -> bool:
+        if self.current_limit is None or abs(block.current) <= self.current_limit:
+            self._strained, self._strained_polls = None, 0
+            return False
+        self._strained = self._strained or block
+        self._strained_polls += 1
+        return self._strained_polls > _STALL_POLLS and block.sent_s - self._strained.received_s >= _STRAIN_S

@@ -17,6 +17,7 @@ COUNTS_PER_TURN = 4096
 VELOCITY_UNIT = 0.229 * 2.0 * math.pi / 60.0  # rad/s, 0.229 rev/min
 ACCELERATION_UNIT = 214.577 * 2.0 * math.pi / 3600.0  # rad/s^2, 214.577 rev/min^2
 WATCHDOG_UNIT_S = 0.020
+FULL_PWM = 885  # the whole supply voltage
 VOLTAGE_UNIT_V = 0.1
 
 
@@ -68,6 +69,8 @@ PROTOCOL_TYPE = Register("Protocol Type", 13, 1)
 HOMING_OFFSET = Register("Homing Offset", 20, 4, True, "count")
 MAX_VOLTAGE_LIMIT = Register("Max Voltage Limit", 32, 2, unit="0.1 V")
 MIN_VOLTAGE_LIMIT = Register("Min Voltage Limit", 34, 2, unit="0.1 V")
+PWM_LIMIT = Register("PWM Limit", 36, 2, unit="0.113 %")
+CURRENT_LIMIT = Register("Current Limit", 38, 2)  # unit by model; not on XL430
 VELOCITY_LIMIT = Register("Velocity Limit", 44, 4, unit="0.229 rev/min")
 MAX_POSITION_LIMIT = Register("Max Position Limit", 48, 4, unit="count")
 MIN_POSITION_LIMIT = Register("Min Position Limit", 52, 4, unit="count")
@@ -78,6 +81,7 @@ POSITION_D_GAIN = Register("Position D Gain", 80, 2)
 POSITION_I_GAIN = Register("Position I Gain", 82, 2)
 POSITION_P_GAIN = Register("Position P Gain", 84, 2)
 BUS_WATCHDOG = Register("Bus Watchdog", 98, 1, True, "20 ms")
+GOAL_PWM = Register("Goal PWM", 100, 2, True, "0.113 %")
 PROFILE_ACCELERATION = Register("Profile Acceleration", 108, 4, unit="214.577 rev/min^2")
 PROFILE_VELOCITY = Register("Profile Velocity", 112, 4, unit="0.229 rev/min")
 GOAL_POSITION = Register("Goal Position", 116, 4, True, "count")
@@ -195,23 +199,26 @@ class ServoModel:
     number : int
         Register Model Number.
     current_unit_a : float or None
-        Of Present Current [A]; None where that register is a load estimate.
+        Of Present Current and Current Limit [A]; None where there is no current sensor.
+    highest_current : int
+        That Current Limit takes, in that unit; 0 where there is none.
     """
 
     name: str
     number: int
     current_unit_a: float | None
+    highest_current: int
 
 
 MODELS = {
     model.name: model
     for model in (
-        ServoModel("XM430-W350", 1020, 0.00269),
-        ServoModel("XM430-W210", 1030, 0.00269),
-        ServoModel("XM540-W270", 1120, 0.00269),
-        ServoModel("XM540-W150", 1130, 0.00269),
-        ServoModel("XL430-W250", 1060, None),
-        ServoModel("XL330-M077", 1190, 0.001),
-        ServoModel("XL330-M288", 1200, 0.001),
+        ServoModel("XM430-W350", 1020, 0.00269, 1193),
+        ServoModel("XM430-W210", 1030, 0.00269, 1193),
+        ServoModel("XM540-W270", 1120, 0.00269, 2047),
+        ServoModel("XM540-W150", 1130, 0.00269, 2047),
+        ServoModel("XL430-W250", 1060, None, 0),
+        ServoModel("XL330-M077", 1190, 0.001, 1750),
+        ServoModel("XL330-M288", 1200, 0.001, 1750),
     )
 }

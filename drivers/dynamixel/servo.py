@@ -17,11 +17,12 @@ from typing import Literal
 
 from drivers.dynamixel import registers as reg
 from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.commissioning import Settings, commission
+from drivers.dynamixel.commissioning import commission, torque_on
 from drivers.dynamixel.joint import Joint
 from drivers.dynamixel.leg import Leg, Outcome
+from drivers.dynamixel.settings import Settings, settings_of
 from drivers.dynamixel.watchdog import Watchdog
-from gonio.errors import ConfigurationError, DeviceError, LimitError, ProtocolError
+from gonio.errors import ConfigurationError, DeviceError, ProtocolError
 from gonio.interfaces import AxisLimits, AxisReading
 
 logger = logging.getLogger(__name__)
@@ -62,6 +63,11 @@ class Servo:
         Without progress for so long in rig time, the move has failed [s].
     watchdog_s : float, optional
         The servo stops by itself if it hears nothing for so long during a move [s], at most 2.54; None for never.
+    current_limit : float, optional
+        A move with more current than this for 0.2 s has failed [A]; also the servo's own limit, which position mode does
+        not obey. None for none, and on models without a current sensor.
+    pwm_limit : float, optional
+        Share of the supply that the servo may use, 0 to 1, which bounds its torque; None leaves it as it is.
 
     Raises
     ------
@@ -88,6 +94,8 @@ class Servo:
         settle_s: float = 0.05,
         stall_s: float = 2.0,
         watchdog_s: float | None = None,
+        current_limit: float | None = None,
+        pwm_limit: float | None = None,
     ) -> None:
         self._bus = bus
         self._id = servo_id
@@ -95,14 +103,16 @@ class Servo:
         self._limits = AxisLimits(lower, upper, velocity)
         self._settle_s = settle_s
         self._stall_s = stall_s
-        self._check_parameters(model, acceleration, watchdog_s)
-        self._settings = Settings(
-            reg.MODELS[model],
-            self._joint.low_counts,
-            self._joint.high_counts,
-            max(1, int(velocity / reg.VELOCITY_UNIT)),
-            max(1, int(acceleration / reg.ACCELERATION_UNIT)),
-        )
+        if not 0 <= servo_id <= 252:
+            raise ConfigurationError(f"Axis {name}: id {servo_id} is outside 0 to 252.")
+        if not 0.0 < settle_s < stall_s:
+            raise ConfigurationError(
+                f"Axis {name}: settle_s = {settle_s:g} must be above 0 and below stall_s = {stall_s:g}."
+            )
+        self._settings = settings_of(
+            self._joint, model, velocity=velocity, acceleration=acceleration, current_limit=current_limit,
+            pwm_limit=pwm_limit,
+        )  # fmt: skip
         self._watchdog = Watchdog(bus, servo_id, self._settings, watchdog_s)
         self._connected = False
         self._identity: dict[str, object] = {}
@@ -114,24 +124,6 @@ class Servo:
         self._engaged = False  # the last move did, so the play lies there
         self._resends = 0
         bus.register(servo_id, self)
-
-    def _check_parameters(self, model: str, acceleration: float, watchdog_s: float | None) -> None:
-        def refuse(text: str) -> ConfigurationError:
-            return ConfigurationError(f"Axis {self.name}: {text}.")
-
-        if not 0 <= self._id <= 252:
-            raise refuse(f"id {self._id} is outside 0 to 252")
-        if model not in reg.MODELS:
-            raise refuse(f"model {model!r} is not known; one of {', '.join(reg.MODELS)}")
-        if not self._limits.velocity > 0.0 or not acceleration > 0.0:
-            raise refuse(
-                f"velocity {math.degrees(self._limits.velocity):g} deg/s and acceleration "
-                f"{math.degrees(acceleration):g} deg/s^2 must be above 0 (0 would mean unlimited to the servo)"
-            )
-        if not 0.0 < self._settle_s < self._stall_s:
-            raise refuse(f"settle_s = {self._settle_s:g} must be above 0 and below stall_s = {self._stall_s:g}")
-        if watchdog_s is not None and not 0.0 < watchdog_s <= 127 * reg.WATCHDOG_UNIT_S:
-            raise refuse(f"watchdog {watchdog_s:g} s is outside 0 to 2.54 s")
 
     # -- connection
 
@@ -154,29 +146,9 @@ class Servo:
             With the first thing that is wrong.
         """
         self._identity = commission(self._bus, self._id, self._settings)
-        self._torque_on()
+        self.halted(torque_on(self._bus, self._id, self._joint))
         self._connected = True
         logger.info("axis %s connected: %s", self.name, self._identity)
-
-    def _torque_on(self) -> None:
-        present = self._bus.agreed_block(self._id)
-        holds = bool(self._read(reg.TORQUE_ENABLE))
-        goal = self.clip(present.position)
-        if abs(goal - present.position) > self._joint.tolerance_counts:
-            raise LimitError(
-                f"{self._label} stands at {self._at(present.position)}, outside its limits of "
-                f"{self._joint.limits_text}; {'switch its torque off and ' if holds else ''}turn it into them by hand, "
-                "or correct the limits."
-            )
-        if holds and not present.in_motion:
-            goal = present.goal  # a new one would only move it
-        if present.goal != goal:
-            self._send_goal(goal)
-        if not holds:
-            self._bus.command(self._id, reg.TORQUE_ENABLE, 1)
-            if not self._read(reg.TORQUE_ENABLE):
-                raise DeviceError(f"{self._label} does not switch its torque on; power-cycle it and retry.")
-        self.halted(self._bus.block(self._id).goal)
 
     # -- Axis
 
@@ -218,7 +190,10 @@ class Servo:
         self._start_leg()
 
     def _start_leg(self) -> None:
-        self._leg = Leg(self._legs[0], self._joint.tolerance_counts, self._settle_s, self._stall_s, self._bus.clock.now())
+        self._leg = Leg(
+            self._legs[0], self._joint.tolerance_counts, self._settle_s, self._stall_s, self._bus.clock.now(),
+            self._settings.current_limit,
+        )  # fmt: skip
 
     def settled(self) -> bool:
         """Poll: True once the axis stands at its goal by every sign it can give.
@@ -282,8 +257,8 @@ class Servo:
             self._arrived = False  # pushed away
             self._start_leg()
         outcome = self._leg.see(block)
-        if outcome is Outcome.STALLED:
-            self._give_up(block)
+        if outcome in (Outcome.STALLED, Outcome.STRAINED):
+            self._give_up(block, outcome)
         return outcome is Outcome.AT_REST and self._finish_leg()
 
     def _finish_leg(self) -> bool:
@@ -314,8 +289,8 @@ class Servo:
         logger.warning("axis %s: goal %d instead of %d, sent again", self.name, block.goal, self._legs[0])
         self._send_goal(self._legs[0])
 
-    def _give_up(self, block: reg.Block) -> None:
-        """No progress: let go of the load, say what was seen."""
+    def _give_up(self, block: reg.Block, outcome: Outcome) -> None:
+        """No progress, or at too much current: let go of the load, say what was seen."""
         goal = self._legs[0]
         tripped = self._watchdog.tripped()
         current = self._current_a(block)
@@ -329,6 +304,12 @@ class Servo:
             raise DeviceError(
                 f"{self._label} was stopped by its own watchdog at {self._at(block.position)} on the way to "
                 f"{self._at(goal)}: the computer was silent too long; raise watchdog_s and resume."
+            )
+        if outcome is Outcome.STRAINED:
+            raise DeviceError(
+                f"{self._label} draws {abs(current):.2f} A at {self._at(block.position)} on the way to {self._at(goal)}, "
+                f"its limit is {self._settings.current_limit_a:.2f} A; it holds there: look for an obstacle or too heavy a "
+                "load, or raise current_limit_a."
             )
         load = "" if math.isnan(current) else f" with {current:.2f} A"
         raise DeviceError(
@@ -368,6 +349,8 @@ class Servo:
             "upper_deg": math.degrees(self._limits.upper),
             "velocity_deg_s": math.degrees(self._settings.profile_velocity * reg.VELOCITY_UNIT),
             "acceleration_deg_s2": math.degrees(self._settings.profile_acceleration * reg.ACCELERATION_UNIT),
+            "current_limit_a": self._settings.current_limit_a,
+            "pwm_limit": self._settings.pwm_share,
             "approach": self._joint.approach,
             "overshoot_counts": self._joint.overshoot_counts,
             "tolerance_counts": self._joint.tolerance_counts,

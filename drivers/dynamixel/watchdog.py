@@ -12,7 +12,8 @@ import logging
 
 from drivers.dynamixel import registers as reg
 from drivers.dynamixel.bus import Bus
-from drivers.dynamixel.commissioning import Settings
+from drivers.dynamixel.settings import Settings
+from gonio.errors import ConfigurationError
 
 logger = logging.getLogger(__name__)
 
@@ -27,10 +28,17 @@ class Watchdog:
     settings : Settings
         Of the servo; its profile is given back after a trip.
     seconds : float or None
-        Silence after which the servo stops [s]; None for never: then nothing here sends a byte.
+        Silence after which the servo stops [s], at most 2.54; None for never: then nothing here sends a byte.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is outside its range.
     """
 
     def __init__(self, bus: Bus, servo_id: int, settings: Settings, seconds: float | None) -> None:
+        if seconds is not None and not 0.0 < seconds <= 127 * reg.WATCHDOG_UNIT_S:
+            raise ConfigurationError(f"{bus.label(servo_id)}: watchdog {seconds:g} s is outside 0 to 2.54 s.")
         self._bus = bus
         self._id = servo_id
         self._settings = settings

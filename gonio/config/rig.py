@@ -67,6 +67,10 @@ class AxisConfig:
         How far from its goal the servo may come to rest; the measured angle is used, never the goal.
     u_zero : float
         Standard uncertainty of the axis' zero [rad].
+    current_limit_a : float or None
+        More current than this during a move stops it [A]; None for no such limit.
+    pwm_limit : float or None
+        Share of the supply that the servo may use; None leaves the servo's own setting.
     """
 
     name: str
@@ -82,6 +86,8 @@ class AxisConfig:
     overshoot: float
     tolerance_counts: int
     u_zero: float
+    current_limit_a: float | None = None
+    pwm_limit: float | None = None
 
     def angle(self, counts: float) -> float:
         """Joint angle [rad] at a position of the servo."""
@@ -304,6 +310,10 @@ def _axis(table: Table, name: str) -> AxisConfig:
         overshoot=table.angle("overshoot_deg", 2.0, lower=1.0, upper=20.0),
         tolerance_counts=table.integer("tolerance_counts", 12, lower=1, upper=200, unit="counts"),
         u_zero=table.angle("u_zero_deg", 0.1, lower=0.0, upper=10.0),
+        current_limit_a=(
+            table.number("current_limit_a", above=0.0, upper=6.0, unit="A") if "current_limit_a" in table else None
+        ),
+        pwm_limit=table.number("pwm_limit", lower=0.01, upper=1.0) if "pwm_limit" in table else None,
     )
     table.finish()
     if config.direction == 0:

@@ -140,6 +140,9 @@ def _servos(config: RigConfig, setup: str) -> Iterator[Finding]:
                     yield Finding(subject, f"{state}; {reg.hardware_errors(errors)}", "find the cause, then power-cycle it")
                 elif delay:
                     yield Finding(subject, f"{state}; answers {2 * delay} us late", setup)
+                elif changes := service.differences(bus, name, axis.id, config):
+                    differing = ", ".join(f"{r.name} is {now}, rig.toml means {new}" for r, (now, new) in changes.items())
+                    yield Finding(subject, f"{state}; {differing}", setup)
                 else:
                     yield Finding(subject, state)
             spare = sorted(set(found) - {axis.id for axis in config.axes.values()})

@@ -332,6 +332,8 @@ def servo_of(bus: Bus, axis: AxisConfig, watchdog_s: float | None) -> Servo:
         overshoot=axis.overshoot,
         tolerance_counts=axis.tolerance_counts,
         watchdog_s=watchdog_s,
+        current_limit=axis.current_limit_a,
+        pwm_limit=axis.pwm_limit,
     )
 
 

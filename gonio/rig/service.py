@@ -19,6 +19,7 @@ from gonio.rig.opening import WallClock, open_axes
 
 if TYPE_CHECKING:
     from drivers.dynamixel import Bus, Servo
+    from drivers.dynamixel.registers import Register
 
 _HOLDER_S = 10.0  # for a process that was asked to stop to let go of the port
 _STEP_S = 0.05
@@ -139,22 +140,26 @@ def _servo_for(config: RigConfig, axis: str, found: Sequence[Found], *, alone: b
 
 def _changes(bus: Bus, axis: str, servo: Found, config: RigConfig) -> list[Change]:
     """Of the settings in EEPROM, id and rate apart."""
-    from drivers.dynamixel.commissioning import eeprom_changes
-
-    settings = _as_axis(bus, axis, servo, config).settings
     return [
         Change(axis, servo, register.name, now, new)
-        for register, (now, new) in eeprom_changes(bus, servo.id, settings).items()
+        for register, (now, new) in differences(bus, axis, servo.id, config).items()
     ]
 
 
-def _as_axis(bus: Bus, axis: str, servo: Found, config: RigConfig) -> Servo:
+def differences(bus: Bus, axis: str, servo_id: int, config: RigConfig) -> dict[Register, tuple[int, int]]:
+    """Settings in a servo's EEPROM that are not as rig.toml says: what they are, and what they should be."""
+    from drivers.dynamixel.commissioning import eeprom_changes
+
+    return eeprom_changes(bus, servo_id, _as_axis(bus, axis, servo_id, config).settings)
+
+
+def _as_axis(bus: Bus, axis: str, servo_id: int, config: RigConfig) -> Servo:
     """The axis as rig.toml has it, under the id that its servo has now; not connected."""
     from dataclasses import replace
 
     from gonio.rig.opening import servo_of
 
-    return servo_of(bus, replace(config.axes[axis], id=servo.id), None)
+    return servo_of(bus, replace(config.axes[axis], id=servo_id), None)
 
 
 def apply(config: RigConfig, make: BusAt, changes: Sequence[Change]) -> None:
@@ -175,7 +180,7 @@ def apply(config: RigConfig, make: BusAt, changes: Sequence[Change]) -> None:
         with make(servo.baud) as bus:
             bus.write(servo.id, reg.STATUS_RETURN_LEVEL, 2)
             bus.write(servo.id, reg.TORQUE_ENABLE, 0)
-            write_eeprom(bus, servo.id, _as_axis(bus, axis, servo, config).settings)
+            write_eeprom(bus, servo.id, _as_axis(bus, axis, servo.id, config).settings)
             # as sync writes, which nobody answers: from which id and at which rate an answer would come is not documented
             if "ID" in own:
                 new_id = own["ID"].new

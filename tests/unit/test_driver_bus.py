@@ -443,6 +443,8 @@ def test_registers_are_those_of_the_makers_table() -> None:
                 name = "Present Load"
             if name in entries:
                 assert (register.address, register.size) == entries[name], (model.name, name)
+            elif name == "Current Limit":
+                assert model.current_unit_a is None and model.highest_current == 0
             else:
                 assert name in ("Protocol Type", "Protocol Version"), (model.name, name)
 

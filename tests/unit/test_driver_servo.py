@@ -118,6 +118,7 @@ def test_connect_puts_the_settings_into_the_servo(bench: Bench) -> None:
     # 60 deg/s = 10 rev/min, and 43.67 times 0.229 rev/min; 300 deg/s^2 = 3000 rev/min^2, 13.98 times 214.577
     assert rig.register(112, 4) == 43
     assert rig.register(108, 4) == 13
+    assert rig.register(44, 4) == 43  # the servo's own limit
     assert rig.sim.torque
     described = servo.describe()
     assert described["model_number"] == 1020
@@ -325,6 +326,52 @@ def test_stall_names_goal_and_position_and_lets_go(bench: Bench) -> None:
     assert rig.sim.torque
 
 
+def test_current_and_pwm_limits_are_written_and_read_back(bench: Bench) -> None:
+    rig = bench()
+    rig.sim.write(64, b"\x01", 0.0)
+    servo = rig.connected(current_limit=1.0, pwm_limit=0.5)
+    assert rig.register(38, 2) == 371  # of 2.69 mA
+    assert rig.register(36, 2) == rig.register(100, 2) == 442  # of 885, the one at power-up and the one from now on
+    described = servo.describe()
+    assert described["current_limit_a"] == pytest.approx(0.998, abs=1e-3)
+    assert described["pwm_limit"] == pytest.approx(0.4994, abs=1e-4)
+    before = rig.writes(36)
+    servo.connect()
+    assert rig.writes(36) == before == 1  # EEPROM that is right is left alone
+    untouched = bench()
+    untouched.sim.write(36, (700).to_bytes(2, "little"), 0.0)
+    assert untouched.connected().describe()["pwm_limit"] is None
+    assert untouched.register(36, 2) == 700
+
+
+def test_a_model_without_a_current_sensor_has_a_pwm_limit(bench: Bench) -> None:
+    rig = bench(model=XL430_W250)
+    rig.connected(model="XL430-W250", pwm_limit=0.8)
+    assert rig.register(36, 2) == 708
+    with pytest.raises(ConfigurationError, match=r"Axis arm: XL430-W250 has no current sensor.*use pwm_limit"):
+        bench(model=XL430_W250).servo(model="XL430-W250", current_limit=0.5)
+
+
+def test_too_much_current_stops_the_move_and_names_both_currents(bench: Bench) -> None:
+    """An obstacle: the servo pushes with its stall current, 2.3 A, long before the move counts as stalled."""
+    rig = bench([Fault("obstacle", at_goal_write=1, after_s=0.5, ahead_counts=5.0)])
+    servo = rig.connected(current_limit=1.0)
+    servo.move_to(90 * DEG)
+    with pytest.raises(DeviceError, match=r"draws 2\.\d\d A at \d+\.\d\d deg .*to 90\.00 deg, its limit is 1\.00 A; it holds"):
+        rig.finish(servo)
+    assert rig.clock.now() < 1.3
+    assert rig.sim.torque
+    assert rig.register(116, 4) == pytest.approx(rig.sim.shaft_counts(rig.clock.now()), abs=2)
+
+
+def test_the_current_of_a_move_is_not_too_much(bench: Bench) -> None:
+    rig = bench()
+    servo = rig.connected(current_limit=1.0)
+    for angle in (60.0, -60.0, 0.0):
+        servo.move_to(angle * DEG)
+        rig.finish(servo)
+
+
 def test_a_servo_that_falls_silent(bench: Bench) -> None:
     rig = bench([Fault("silent", servo_id=1, at_goal_write=1)])
     servo = rig.connected()
@@ -391,6 +438,8 @@ def test_before_connect_nothing_moves(bench: Bench) -> None:
         ({"overshoot": 0.5 * DEG}, "overshoot 0.5 deg"),
         ({"approach": "sideways"}, "up, down or any"),
         ({"watchdog_s": 3.0}, "0 to 2.54"),
+        ({"current_limit": 5.0}, r"current limit 5 A is outside 0 to 3\.21 A of XM430-W350"),
+        ({"pwm_limit": 1.2}, r"PWM limit 1\.2 is outside 0 to 1"),
     ],
 )
 def test_parameters_outside_their_range(bench: Bench, changes: dict[str, object], message: str) -> None:
