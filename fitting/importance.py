@@ -3,8 +3,8 @@ r"""Importance sampling from a mixture of Student's t about the modes: the fast 
 A posterior of many samples is nearly Gaussian in the walked coordinates. Draws of t distributions with 5 degrees of freedom
 about its modes, weighted with the ratio of the densities, are then worth most of their number, and independent; a chain
 needs ten or more steps for each. A share of the draws comes from a three times wider mixture, so that a tail which the modes
-do not show is found. If the first draws say that the shape is off, mean and covariance of each component are fitted to the
-weighted draws, a few times over [1]_; draws that served so are not used again.
+do not show is found. If the weights say that the shape is off, as of a curved ridge, a mixture of more components is fitted
+to the draws, a few times over [1]_; draws that served so are not used again.
 
 Whether the weights can be trusted is judged by the tail of their distribution (`fitting.psis`); if not, nothing is returned
 and a sampler has to walk. A mode that nobody found is not seen by either.
@@ -31,8 +31,11 @@ from fitting.optimum import Mode
 Array = NDArray[np.float64]
 FREEDOM = 5.0  # of Student's t
 _WIDE, _WIDE_SHARE = 3.0, 0.05
-_PILOT, _ROUNDS = 1000, 4
-_GOOD, _LEAST = 0.3, 0.03  # share of draws that count: enough not to adapt, too few to go on
+_PILOT, _ROUNDS = 1000, 7
+_POOR = 0.25  # share of draws that count below which another proposal is fitted
+_LEAST = 10.0  # effective draws to fit one to
+_FITTED, _STEPS = 1000, 12  # draws and steps of a fit
+_MOST = 50  # proposals for each effective draw wanted
 
 
 @dataclass(frozen=True)
@@ -77,23 +80,23 @@ class Mixture:
         """Log density, shape (n,), up to a constant."""
         return np.asarray(np.logaddexp.reduce(self.log_densities(u), axis=1))
 
-    def adapted(self, u: Array, log_weights: Array) -> Mixture:
-        """The mixture with shares, means and scales of weighted draws [1]_; a component without draws stays."""
-        densities = self.log_densities(u)
-        share = np.exp(log_weights[:, None] + densities - np.logaddexp.reduce(densities, axis=1)[:, None])
-        mass = share.sum(axis=0)
-        means, factors = self.means.copy(), self.factors.copy()
-        d = u.shape[1]
-        for m in range(len(mass)):
-            if mass[m] ** 2 < 3.0 * d * np.sum(share[:, m] ** 2):  # fewer than 3 d effective draws
-                continue
-            w = share[:, m] / mass[m]
-            means[m] = w @ u
-            apart = u - means[m]
-            covariance = (w[:, None] * apart).T @ apart
-            covariance += 1e-9 * np.trace(covariance) / d * np.eye(d)
-            factors[m] = np.linalg.cholesky(covariance)
-        return Mixture(np.maximum(mass, 1e-3) / np.maximum(mass, 1e-3).sum(), means, factors)
+    @classmethod
+    def fitted(cls, u: Array, count: int, rng: np.random.Generator) -> Mixture:
+        """With shares, means and scales of draws u (n, d) of equal weight, by expectation maximisation from a random start."""
+        n, d = u.shape
+        spread = np.cov(u.T).reshape(d, d)
+        least = 1e-4 * spread + 1e-12 * np.trace(spread) / d * np.eye(d)  # of a component that sees copies of one draw
+        means = u[rng.choice(n, count, replace=False)]
+        found = cls(np.full(count, 1.0 / count), means, np.repeat(np.linalg.cholesky(spread + least)[None], count, axis=0))
+        for _ in range(_STEPS):
+            densities = found.log_densities(u)
+            part = np.exp(densities - np.logaddexp.reduce(densities, axis=1)[:, None])
+            mass = part.sum(axis=0) + 1e-9
+            means = (part.T @ u) / mass[:, None]
+            apart = u[:, None, :] - means  # (n, m, d)
+            scale = np.einsum("nm,nmi,nmj->mij", part, apart, apart) / mass[:, None, None] + least
+            found = cls(mass / mass.sum(), means, np.linalg.cholesky(scale))
+        return found
 
 
 @dataclass(frozen=True)
@@ -135,32 +138,37 @@ def run(target: Target, modes: Sequence[Mode], *, seed: int, effective: int = 40
         Independent parts into which the draws are cut, so that they can be compared.
     """
     rng = np.random.default_rng(seed)
-    proposal = Mixture.about(modes)
-    used = 0
-    for _ in range(_ROUNDS):
-        u, log_weights, _ = _propose(target, proposal, _PILOT, rng)
-        used += _PILOT
+    proposal, used, n = Mixture.about(modes), 0, _PILOT
+    for number in range(_ROUNDS):
+        each = math.ceil(n / batches)
+        parts = [_propose(target, proposal, each, child) for child in rng.spawn(batches)]
+        used += each * batches
+        log_weights = np.concatenate([w for _, w, _ in parts])
         smoothed, k_hat = psis.smooth(log_weights)
-        share = float(psis.effective(smoothed)) / _PILOT if np.isfinite(log_weights).any() else 0.0
-        if k_hat <= psis.GOOD and share > _GOOD:
-            break
-        if share * _PILOT > 2.0:
-            proposal = proposal.adapted(u, smoothed)
-    if not (k_hat <= psis.GOOD and share > _LEAST):
-        return None
-    each = math.ceil(1.15 * effective / batches / share)
-    parts = [_propose(target, proposal, each, child) for child in rng.spawn(batches)]
-    used += each * batches
-    smoothed, k_hat = psis.smooth(np.concatenate([w for _, w, _ in parts]))
-    if not k_hat <= psis.GOOD:
-        return None
-    count = effective // batches
-    draws = np.empty((batches, count, parts[0][2].x.shape[1]))
-    log_posterior = np.empty((batches, count))
-    for b, (_, _, drawn) in enumerate(parts):
-        chosen = _again(np.exp(smoothed[b * each : (b + 1) * each]), count, rng)
-        draws[b], log_posterior[b] = drawn.x[chosen], drawn.log_posterior[chosen]
-    return Weighted(draws, log_posterior, float(k_hat), float(psis.effective(smoothed)), used)
+        worth = float(psis.effective(smoothed)) if np.isfinite(log_weights).any() else 0.0
+        if k_hat <= psis.GOOD and worth >= effective:
+            return _collected(parts, smoothed, effective // batches, float(k_hat), worth, used, rng)
+        if worth < _LEAST:
+            return None
+        share = worth / (each * batches)
+        if k_hat > psis.GOOD or share < _POOR:
+            u = np.concatenate([u for u, _, _ in parts])[_again(np.exp(smoothed), _FITTED, rng)]
+            proposal = Mixture.fitted(u, len(modes) + number, rng)
+        # as many as are needed if the next proposal is as good as this one or one of `_POOR`
+        n = min(math.ceil(1.2 * effective / max(share, _POOR)), 2 * n if k_hat > psis.GOOD else _MOST * effective)
+    return None
+
+
+def _collected(
+    parts: Sequence[tuple[Array, Array, Drawn]], smoothed: Array, count: int, k_hat: float, worth: float, used: int,
+    rng: np.random.Generator,
+) -> Weighted:  # fmt: skip
+    """`count` draws of equal weight from each part."""
+    each = len(parts[0][1])
+    chosen = [_again(np.exp(smoothed[b * each : (b + 1) * each]), count, rng) for b in range(len(parts))]
+    draws = np.array([drawn.x[rows] for (_, _, drawn), rows in zip(parts, chosen, strict=True)])
+    log_posterior = np.array([drawn.log_posterior[rows] for (_, _, drawn), rows in zip(parts, chosen, strict=True)])
+    return Weighted(draws, log_posterior, k_hat, worth, used)
 
 
 def _propose(target: Target, proposal: Mixture, n: int, rng: np.random.Generator) -> tuple[Array, Array, Drawn]:

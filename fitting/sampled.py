@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitting import importance, marginal, optimum, psis, sample
-from fitting.diagnostics import RHAT_LIMIT, split_rhat
+from fitting.diagnostics import split_rhat
 from fitting.likelihood import Problem
 from fitting.marginal import Target, Whole
 from fitting.optimum import Mode
@@ -92,7 +92,7 @@ def run(
             tops = tuple(modes)
         if not chain and walk is None:
             found = importance.run(attempt, tops, seed=second, effective=rule.effective, batches=rule.ensembles)
-            if found is not None and bool(np.all(split_rhat(found.draws) < RHAT_LIMIT)):
+            if found is not None:
                 return _of_importance(attempt, found)
         sampled = _of_walk(attempt, tops, third, rule, progress, walk)
         if sampled is not None:

@@ -1,13 +1,9 @@
-"""Whole fits of data whose truth is known, made here from plain NumPy and rotation matrices.
-
-The rig of these tests: camera along +z, light arm gamma about y, sample pan about y and tilt about x, as in gonio; each
-axis has a zero error shared by all poses and a fresh encoder error in each.
-"""
+"""Whole fits of data whose truth is known, made here from plain NumPy and rotation matrices."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,22 +12,9 @@ from scipy import stats
 from fitting import Rule, fit
 from gonio.errors import ConvergenceError, ParameterError
 from gonio.samples import BRDFSamples, SharedError
+from tests.measurements import measure
 
 QUICK = Rule(ensembles=2, taus=15, drift=0.3, first=150)
-U_SCALE, U_ZERO, U_ENCODER = 0.01, math.radians(0.1), math.radians(0.025)
-
-
-def rotation(axis, angle):
-    c, s, o, i = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
-    rows = [[c, o, s], [o, i, o], [-s, o, c]] if axis == "y" else [[i, o, o], [o, c, -s], [o, s, c]]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-
-
-def directions(gamma, beta, tau):
-    """Light and camera in the frame of the sample, each (n, 3)."""
-    sample = rotation("y", beta) @ rotation("x", tau)
-    light = np.stack((np.sin(gamma), np.zeros_like(gamma), np.cos(gamma)), axis=-1)
-    return np.einsum("nji,nj->ni", sample, light), sample[:, 2, :]
 
 
 def material(wi, wr, albedo, alpha, f_0, lobe="ggx"):
@@ -53,36 +36,16 @@ class Scan:
 
 
 def scan(seed, n, truth=(0.3, 0.25, 0.05), noise=0.01, lobe="ggx", stated=True):
-    rng = np.random.default_rng(seed)
-    pose = np.empty((3, 0))
-    while pose.shape[1] < n:  # arm, pan, tilt; lit and seen, half of them near the mirror condition
-        more = rng.uniform([[-1.5], [-0.9], [-0.7]], [[1.5], [0.9], [0.7]], (3, 8 * n))
-        near = rng.random(8 * n) < 0.5
-        more[0, near] = 2 * more[1, near] + rng.normal(0, 0.25, near.sum())
-        wi, wr = directions(*more)
-        pose = np.concatenate((pose, more[:, (wi[:, 2] > 0.15) & (wr[:, 2] > 0.15) & (abs(more[0]) < 1.7)]), axis=1)
-    pose = pose[:, :n]
-    scale, *zeros = rng.normal(0, [U_SCALE, U_ZERO, U_ZERO, U_ZERO])
-    actual = pose + np.array(zeros)[:, None] + rng.normal(0, U_ENCODER, (3, n))
-    f = material(*directions(*actual), *truth, lobe=lobe) * np.exp(scale)
-    u = noise * material(*directions(*pose), *truth, lobe=lobe) + 1e-4
-    slopes = []
-    for k in range(3):
-        h = np.zeros((3, 1))
-        h[k] = 1e-6
-        slopes.append([(a - b) / 2e-6 for a, b in zip(directions(*(pose + h)), directions(*(pose - h)), strict=True)])
-    wi, wr = directions(*pose)
-    zero = np.zeros((n, 3))
-    angle = [(np.arccos(np.clip(w[:, 2], -1, 1)), np.arctan2(w[:, 1], w[:, 0]) % (2 * np.pi)) for w in (wi, wr)]
-    shared = (SharedError("scale", U_SCALE), *(SharedError(a, U_ZERO, U_ENCODER, "rad") for a in ("arm", "pan", "tilt")))
-    d_ln_f = np.zeros((n, 4))
-    d_ln_f[:, 0] = 1.0
-    samples = BRDFSamples(
-        *angle[0], *angle[1], f + rng.normal(0, u), u if stated else np.full(n, np.nan), np.arange(n), shared,
-        np.stack([zero, *(s[0] for s in slopes)], axis=-1), np.stack([zero, *(s[1] for s in slopes)], axis=-1), d_ln_f,
-    )  # fmt: skip
-    names = ("lambertian.albedo", "ggx.alpha", "ggx.f_0", "shared.scale", "shared.arm", "shared.pan", "shared.tilt")
-    return Scan(samples, dict(zip(names, (*truth, scale, *zeros), strict=True)))
+    samples, errors = measure(
+        np.random.default_rng(seed),
+        lambda wi, wr: material(wi, wr, *truth, lobe=lobe),
+        n,
+        lambda wi, wr: noise * material(wi, wr, *truth, lobe=lobe) + 1e-4,
+    )
+    if not stated:
+        samples = replace(samples, u_f_r=np.full(n, np.nan))
+    names = ("lambertian.albedo", "ggx.alpha", "ggx.f_0")
+    return Scan(samples, dict(zip(names, truth, strict=True)) | errors)
 
 
 def pulls(posterior, truth):
