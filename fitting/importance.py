@@ -33,8 +33,9 @@ FREEDOM = 5.0  # of Student's t
 _WIDE, _WIDE_SHARE = 3.0, 0.05
 _PILOT, _ROUNDS = 1000, 7
 _POOR = 0.25  # share of draws that count below which another proposal is fitted
-_LEAST = 10.0  # effective draws to fit one to
+_LEAST = 5.0  # effective draws to fit one to
 _FITTED, _STEPS = 1000, 12  # draws and steps of a fit
+_EACH = 10.0  # effective draws for each coordinate of a component
 _MOST = 50  # proposals for each effective draw wanted
 
 
@@ -82,7 +83,7 @@ class Mixture:
 
     @classmethod
     def fitted(cls, u: Array, count: int, rng: np.random.Generator) -> Mixture:
-        """With shares, means and scales of draws u (n, d) of equal weight, by expectation maximisation from a random start."""
+        """With shares, means and scales of draws u (n, d) of equal weight: expectation maximisation from a random start."""
         n, d = u.shape
         spread = np.cov(u.T).reshape(d, d)
         least = 1e-4 * spread + 1e-12 * np.trace(spread) / d * np.eye(d)  # of a component that sees copies of one draw
@@ -153,7 +154,8 @@ def run(target: Target, modes: Sequence[Mode], *, seed: int, effective: int = 40
         share = worth / (each * batches)
         if k_hat > psis.GOOD or share < _POOR:
             u = np.concatenate([u for u, _, _ in parts])[_again(np.exp(smoothed), _FITTED, rng)]
-            proposal = Mixture.fitted(u, len(modes) + number, rng)
+            # a component needs draws that are not copies of a few
+            proposal = Mixture.fitted(u, max(1, min(len(modes) + number, int(worth / (_EACH * u.shape[1])))), rng)
         # as many as are needed if the next proposal is as good as this one or one of `_POOR`
         n = min(math.ceil(1.2 * effective / max(share, _POOR)), 2 * n if k_hat > psis.GOOD else _MOST * effective)
     return None

@@ -1,7 +1,8 @@
 """Measurements of a material on a goniometer, made from rotation matrices alone, with their truth.
 
-The rig: camera along +z, light arm gamma about y, sample pan about y and tilt about x, as in gonio; each axis has a zero error
-shared by all poses and a fresh encoder error in each, and the white reference an error of scale. Nothing of the fit is used.
+The rig: camera along +z, light arm gamma about y, sample pan about y and tilt about x, as in gonio; each axis has a zero
+error shared by all poses and a fresh encoder error in each, and the white reference an error of scale. Nothing of the fit is
+used.
 """
 
 from __future__ import annotations

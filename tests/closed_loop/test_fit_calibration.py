@@ -107,7 +107,7 @@ def smallest_by_holm(p):
 
 
 def band(sets, coverage=0.95, trials=4000):
-    """Half-width of a simultaneous band of the ranks' distribution function, in binomial sds at each rank: from simulation."""
+    """Half-width of a simultaneous band of the ranks' distribution function, in binomial sds at each rank; simulated."""
     rng = np.random.default_rng(0)
     counts = np.cumsum(np.array([np.bincount(r, minlength=L + 1) for r in rng.integers(0, L + 1, (trials, sets))]), axis=1)
     z = np.arange(1, L + 1) / (L + 1)

@@ -38,7 +38,7 @@ def test_moments_of_a_gaussian_with_a_cut(d):
     assert np.all(np.abs(x.mean(axis=0) - mean) < tolerance * sd)
     assert np.all(np.abs(x.std(axis=0) / sd - 1.0) < tolerance)
     assert found.k_hat <= psis.GOOD
-    assert found.effective == pytest.approx(8000, rel=0.2)
+    assert found.effective >= 8000
 
 
 def test_a_poor_guess_is_adapted():
