@@ -14,49 +14,36 @@ from numpy.typing import NDArray
 from gonio.errors import ConfigurationError, DeviceError, GonioError
 from sim.camera import MessageParser, SimulatedCamera, encode_frame, encode_message
 from sim.clock import ScaledClock
-from sim.links import Link, received
+from sim.links import Link
+from sim.sockets import Listener, received
 
 
-class CameraLink:
-    """The camera's listening socket on 127.0.0.1, on any free port; satisfies `sim.links.Link`."""
+class CameraLink(Listener):
+    """The camera's listening socket on 127.0.0.1, on any free port."""
 
     def __init__(self, camera: SimulatedCamera, clock: ScaledClock) -> None:
+        super().__init__()
         self._camera = camera
         self._clock = clock
-        self.closed = False
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._listener.setblocking(False)
-        self.address: tuple[str, int] = self._listener.getsockname()[:2]
-
-    def fileno(self) -> int:
-        """Of the listening socket."""
-        return self._listener.fileno()
 
     def on_readable(self) -> Sequence[Link]:
-        """Accept a client."""
+        """Accept a client, unless the camera was unplugged."""
         if self._camera.unplugged:
             self.close()
             return ()
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return ()
-        client.setblocking(False)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return (_CameraConnection(self._camera, self._clock, client),)
+        return super().on_readable()
+
+    def welcome(self, client: socket.socket) -> Link:
+        """One more client."""
+        return _CameraConnection(self._camera, self._clock, client)
 
     def due(self) -> float | None:
-        """Never, but at once when the camera was unplugged; exposures belong to the connections."""
+        """At once when the camera was unplugged; exposures belong to the connections."""
         return 0.0 if self._camera.unplugged else None
 
     def on_due(self) -> None:
         """The camera was unplugged."""
         self.close()
-
-    def close(self) -> None:
-        """Listen no longer."""
-        self.closed = True
-        self._listener.close()
 
 
 class _CameraConnection:

@@ -24,6 +24,7 @@ from typing import Protocol
 from gonio.errors import DeviceError
 from sim.clock import ScaledClock
 from sim.dynamixel.control_table import BAUD_RATES
+from sim.sockets import Listener, received
 
 EARLY_S = 2e-4  # how far ahead of a due reply the pump wakes up, to watch the clock: a timer alone is late by as much
 IDLE_S = 0.1  # wall time of silence after which servos forget an unfinished packet; they themselves wait 1.5 ms
@@ -129,16 +130,6 @@ class Pump:
         for key in list(self._selector.get_map().values()):
             if key.data is link:
                 self._selector.unregister(key.fileobj)
-
-
-def received(client: socket.socket) -> bytes | None:
-    """What a client has sent; None if nothing is there, empty if it is gone."""
-    try:
-        return client.recv(65_536)
-    except BlockingIOError:
-        return None
-    except OSError:
-        return b""
 
 
 class _StreamLink:
@@ -322,7 +313,7 @@ class _Connection(_StreamLink):
         self._socket.close()
 
 
-class TcpLink:
+class TcpLink(Listener):
     """A device on a TCP port, for pyserial's ``socket://HOST:PORT``; a new client replaces the one before.
 
     Parameters
@@ -334,54 +325,28 @@ class TcpLink:
         0 for any free one.
     baud : int, optional
         Pace of the bytes [bit/s]; as fast as they come by default.
-
-    Attributes
-    ----------
-    address : tuple of (str, int)
-        Host and port.
     """
 
     def __init__(
         self, device: Device, clock: ScaledClock, host: str = "127.0.0.1", port: int = 0, baud: int | None = None
     ) -> None:
+        super().__init__(host, port)
         self._device = device
         self._clock = clock
         self._baud = baud
         self._client: _Connection | None = None
-        self.closed = False
-        try:
-            self._listener = socket.create_server((host, port))
-        except OSError as error:
-            raise DeviceError(f"Cannot listen on {host}:{port} ({error.strerror}); choose another port.") from error
-        self._listener.setblocking(False)
-        name = self._listener.getsockname()
-        self.address: tuple[str, int] = (name[0], name[1])
 
-    def fileno(self) -> int:
-        return self._listener.fileno()
-
-    def on_readable(self) -> Sequence[Link]:
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return ()
-        client.setblocking(False)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    def welcome(self, client: socket.socket) -> Link:
+        """The only client from now on."""
         if self._client is not None:
             self._client.closed = True
         self._device.idle()
         self._client = _Connection(self._device, self._clock, client, self._baud)
         self._client.parent = self
-        return (self._client,)
-
-    def due(self) -> float | None:
-        return None
-
-    def on_due(self) -> None:
-        return
+        return self._client
 
     def close(self) -> None:
-        self.closed = True
-        self._listener.close()
+        """Listen no longer, and let go of the client."""
+        super().close()
         if self._client is not None:
             self._client.close()

@@ -10,18 +10,19 @@ import socket
 import time
 from collections.abc import Sequence
 
-from gonio.errors import DeviceError, GonioError
+from gonio.errors import GonioError
 from sim.camera import SimulatedCamera
 from sim.clock import ScaledClock
-from sim.links import Link, received
+from sim.links import Link
+from sim.sockets import Listener, received
 
 _BOUNDARY = "frame"
 _HEAD = f"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary={_BOUNDARY}\r\n\r\n"
 _LONGEST_REQUEST = 16_384
 
 
-class MjpegLink:
-    """A listening socket on 127.0.0.1; satisfies `sim.links.Link`.
+class MjpegLink(Listener):
+    """A listening socket on 127.0.0.1 for viewers.
 
     Parameters
     ----------
@@ -40,38 +41,16 @@ class MjpegLink:
     """
 
     def __init__(self, camera: SimulatedCamera, clock: ScaledClock, exposure_s: float = 0.016, port: int = 0) -> None:
+        super().__init__(port=port)
         self.camera = camera
         self.clock = clock
         self.exposure_s = exposure_s
         self.frames = 0
-        self.closed = False
-        try:
-            self._listener = socket.create_server(("127.0.0.1", port))
-        except OSError as error:
-            raise DeviceError(f"Cannot listen on 127.0.0.1:{port} ({error.strerror}); choose another port.") from error
-        self._listener.setblocking(False)
-        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/"
+        self.url = f"http://127.0.0.1:{self.address[1]}/"
 
-    def fileno(self) -> int:
-        return self._listener.fileno()
-
-    def on_readable(self) -> Sequence[Link]:
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return ()
-        client.setblocking(False)
-        return (_Viewer(self, client),)
-
-    def due(self) -> float | None:
-        return None
-
-    def on_due(self) -> None:
-        return
-
-    def close(self) -> None:
-        self.closed = True
-        self._listener.close()
+    def welcome(self, client: socket.socket) -> Link:
+        """One more viewer."""
+        return _Viewer(self, client)
 
     def picture(self) -> bytes:
         """A frame of now, as one part of the stream."""
