@@ -52,7 +52,7 @@ STARTS = 4  # widths of lobe to start from
 FREEDOM = 5.0  # of the proposal: tails heavier than a posterior's
 ROUNDS = 4  # times that a proposal is moved
 ENOUGH = 0.2  # effective draws over draws: a proposal that fits less well may have missed a curved valley altogether
-_ROWS = 4096  # draws times pixels that are evaluated together: their readings stay in the cache
+_TOGETHER = 200_000  # expected readings that are computed together: they stay in the cache
 _RIVAL = 3.0  # a second mode whose log mass is no lower than this below the best one's counts
 
 
@@ -75,6 +75,8 @@ class Job:
         Infer the shared errors; False takes them as exactly 0.
     draws : int
         Per pixel.
+    discrepancy : bool
+        Infer a relative discrepancy of the model, too.
     """
 
     samples: BRDFSamples
@@ -84,6 +86,7 @@ class Job:
     priors: Mapping[str, Sequence[object]] = field(default_factory=dict)
     shared: bool = True
     draws: int = 512
+    discrepancy: bool = False
 
     def __post_init__(self) -> None:
         if self.draws < 64:
@@ -91,7 +94,7 @@ class Job:
 
     def digest(self) -> str:
         """A hash of all that the result depends on, but the readings."""
-        options = [self.model, self.free, dict(self.fix), dict(self.priors), self.shared, self.draws]
+        options = [self.model, self.free, dict(self.fix), dict(self.priors), self.shared, self.draws, self.discrepancy]
         text = json.dumps(options, sort_keys=True, default=list)
         text += repr([(e.name, e.u, e.u_sample, e.unit) for e in self.samples.shared])
         known = hashlib.sha256(text.encode())
@@ -198,8 +201,9 @@ class Engine:
     def __init__(self, job: Job) -> None:
         self.job = job
         self.problem = Problem(
-            job.samples, brdf.parse(job.model), free=job.free, fix=dict(job.fix), priors=dict(job.priors), shared=job.shared
-        )
+            job.samples, brdf.parse(job.model), free=job.free, fix=dict(job.fix), priors=dict(job.priors),
+            shared=job.shared, discrepancy=job.discrepancy,
+        )  # fmt: skip
         self.space = self.problem.space
         self.names = self.space.names
         self._bank = _bank(self.problem)
@@ -253,7 +257,7 @@ class Engine:
                 old[poor[better]] = new[better]
         # draws that stay within a part of the Laplace approximation have not followed a curved valley to its ends
         spread = _moments(self.space.unbounded(x.reshape(-1, d)).reshape(p, s, d), log_weights)[1]
-        short = np.any(_variances(spread) < 0.5 * _variances(mode.factor), axis=1)
+        short = np.any((_variances(spread) < 0.5 * _variances(mode.factor)) & ~given.noise, axis=1)  # noise is folded
         status = np.zeros(p, dtype=np.int8)
         trusted = psis.limit(s)
         for name, true in (
@@ -290,16 +294,16 @@ class Engine:
         """Draws x (p, s, d) from t distributions, their smoothed weights (p, s) and k-hat (p,)."""
         z, log_q = _points(len(self.space), self.job.draws)
         s, d = z.shape
-        x, ratio = np.empty((len(pixel), s, d)), np.empty((len(pixel), s))
-        step = max(1, _ROWS // s)
-        for a in range(0, len(pixel), step):
+        x, total = np.empty((len(pixel) * s, d)), np.empty(len(pixel) * s)
+        step = max(1, _TOGETHER // len(self.job.samples))
+        for a in range(0, len(total), step):
             cut = slice(a, a + step)
-            u = centre[cut, None] + np.einsum("pij,sj->psi", factor[cut], z)
-            natural, log_prior = self.space.natural(u.reshape(-1, d))
-            index = np.repeat(pixel[cut], s)
-            total = log_prior + given.log_likelihood(natural, index)[0]
-            x[cut] = natural.reshape(-1, s, d)
-            ratio[cut] = np.where(np.isfinite(total), total, -np.inf).reshape(-1, s) - log_q
+            row, draw = np.divmod(np.arange(a, min(a + step, len(total))), s)
+            u = centre[row] + np.einsum("rij,rj->ri", factor[row], z[draw])
+            x[cut], log_prior = self.space.natural(u)
+            total[cut] = log_prior + given.log_likelihood(x[cut], pixel[row])[0]
+        ratio = np.where(np.isfinite(total), total, -np.inf).reshape(-1, s) - log_q
+        x = x.reshape(-1, s, d)
         return x, *psis.smooth(ratio)
 
     def _contraction(self, x: Array, weights: Array) -> Array:

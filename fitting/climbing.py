@@ -23,7 +23,7 @@ STEP = 1e-3  # of a coordinate of unit prior width, for slopes by central differ
 ITERATIONS = 60
 _ENOUGH = 1e-3  # gain in log density that a step may still promise at the mode
 _EDGE, _LONGEST = 8.0, 2.0  # of a coordinate; of a step
-_ROWS = 1024
+_TOGETHER = 50_000  # expected readings of one step that are computed together
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class Mode:
 
 def climb(given: Readings, space: Space, start: Array, pixel: NDArray[np.int64]) -> Mode:
     """Modes from starts u (w, d), each for one pixel (w,)."""
-    parts = [_climb(given, space, start[a : a + _ROWS], pixel[a : a + _ROWS]) for a in range(0, len(start), _ROWS)]
+    rows = max(4, _TOGETHER // given.f_r.shape[1])
+    parts = [_climb(given, space, start[a : a + rows], pixel[a : a + rows]) for a in range(0, len(start), rows)]
     return Mode(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Mode)))
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitting import optimum, sample, sampled
-from fitting.diagnostics import advice, contraction, misfit_limit
+from fitting.diagnostics import advice, contraction, entangled, misfit_limit
 from fitting.likelihood import Problem
 from gonio import brdf
 from gonio.errors import DatasetError, ParameterError
@@ -162,6 +162,7 @@ def fit(
         scaled="noise.scale" in names,
         incidences=len(np.unique(np.round(samples.theta_i, 3))),
     )
+    said += entangled(problem.model_names, x[:, [names.index(name) for name in problem.model_names]])
     if given > len(samples):
         said.append(f"a random {len(samples)} of {given} samples were used; raise max_samples to use more")
     if not found.converged:

@@ -34,6 +34,8 @@ class Readings:
     ----------
     used : ndarray of int, shape (p,)
         Readings that are not NaN.
+    noise : ndarray of bool, shape (d,)
+        Which of the parameters are noise.
 
     Raises
     ------
@@ -51,7 +53,7 @@ class Readings:
         self.problem, self.f_r = problem, f_r
         self.used = np.sum(np.isfinite(f_r), axis=1)
         stated = np.nan_to_num(problem.samples.u_f_r) ** 2  # (n,); 0 where it is inferred
-        self._noise = np.array([name.startswith("noise.") for name in problem.space.names])
+        self.noise = np.array([name.startswith("noise.") for name in problem.space.names])
         self._more = np.zeros((1, n))  # variance [1/sr^2] beyond the problem's own
         if u is not None:
             u = np.asarray(u, dtype=float)
@@ -96,7 +98,7 @@ class Readings:
         gradient, fisher = np.zeros((w, d)), np.zeros((w, d, d))
         _normal_kernel(
             mean, var, means.reshape(w, 2, d, n), variances.reshape(w, 2, d, n), self.f_r, self._more, pixel, step,
-            self._noise, value, gradient, fisher,
+            self.noise, value, gradient, fisher,
         )  # fmt: skip
         return value, gradient, fisher
 

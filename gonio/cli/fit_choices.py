@@ -39,7 +39,18 @@ def chosen_fit(
     model = model or (chosen.model if chosen else None)
     if model is None:
         raise ConfigurationError("no model: give --model lambertian+ggx or --config fit.toml")
-    held = dict(chosen.fix) if chosen else {}
+    held = (dict(chosen.fix) if chosen else {}) | held_values(fix)
+    options: dict[str, Any] = {"free": tuple(free) + (chosen.free if chosen else ()), "fix": held}
+    if chosen and chosen.priors:
+        options["priors"] = dict(chosen.priors)
+    if chosen and chosen.max_steps:
+        options["max_steps"] = chosen.max_steps
+    return model, chosen.seed if chosen else 1, options
+
+
+def held_values(fix: tuple[str, ...]) -> dict[str, float]:
+    """Values of --fix NAME=VALUE by name."""
+    held = {}
     for item in fix:
         name, separator, value = item.partition("=")
         try:
@@ -48,9 +59,4 @@ def chosen_fit(
             separator = ""
         if not separator:
             raise ConfigurationError(f"--fix {item}: write it as --fix NAME=VALUE, for example --fix ggx.f_0=0.04")
-    options: dict[str, Any] = {"free": tuple(free) + (chosen.free if chosen else ()), "fix": held}
-    if chosen and chosen.priors:
-        options["priors"] = dict(chosen.priors)
-    if chosen and chosen.max_steps:
-        options["max_steps"] = chosen.max_steps
-    return model, chosen.seed if chosen else 1, options
+    return held

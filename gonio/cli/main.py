@@ -27,6 +27,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "table": ("gonio.cli.derive", "table", "Samples to a tabulated BRDF."),
     "fit": ("gonio.cli.derive", "fit", "Samples to a posterior over model parameters."),
     "fit-batch": ("gonio.cli.batch", "fit_batch", "The same fit for many pixels or channels, on all cores or a cluster."),
+    "compare": ("gonio.cli.compare", "compare", "Which model predicts best, by how much, and is any adequate."),
     "map": ("gonio.cli.map", "map_", "Reflectance map R(p, q) of a scene."),
     "export": ("gonio.cli.export", "export", "Write the data set in another format."),
     "convert": ("gonio.cli.fileverbs", "convert", "A file of one format to another."),

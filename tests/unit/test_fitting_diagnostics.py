@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from fitting.diagnostics import advice, autocorrelation_time, contraction, misfit_limit, split_rhat
+from fitting.diagnostics import advice, autocorrelation_time, contraction, entangled, misfit_limit, split_rhat
 
 
 @pytest.mark.parametrize(("a", "tau"), [(0.9, 19.0), (0.5, 3.0), (0.0, 1.0)])
@@ -82,3 +82,13 @@ GOOD = {
 def test_advice_names_what_is_wrong(change, said):
     assert advice(**GOOD) == []
     assert said in " ".join(advice(**(GOOD | change)))
+
+
+def test_parameters_that_only_their_product_is_known_of_are_named():
+    rng = np.random.default_rng(1)
+    k_s = rng.uniform(0.2, 1.0, 2000)
+    draws = np.column_stack((rng.normal(0.3, 0.01, 2000), k_s, 0.04 / k_s * (1.0 + 0.001 * rng.normal(size=2000))))
+    (said,) = entangled(("lambertian.albedo", "ggx.k_s", "ggx.f_0"), draws)
+    assert "ggx.f_0 and ggx.k_s only together (rank correlation -1.00)" in said
+    assert entangled(("a", "b"), draws[:, :2]) == []
+    assert entangled(("a",), draws[:, :1]) == []
