@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fitting.likelihood import Problem
 from gonio import jit
+from gonio.brdf.elementary import log
 from gonio.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -112,17 +113,14 @@ class Readings:
 
 def _misfit(mean, var, y, extra):  # type: ignore[no-untyped-def]
     """chi^2 and sum of ln s^2 of one pixel."""
-    c, l, scale = 0.0, 0.0, 1.0
+    c, l = 0.0, 0.0
     for j in range(y.size):
         s2 = var[j] + extra[j]
         r = y[j] - mean[j]
         c += r * r / s2 if y[j] == y[j] else 0.0
-    for j in range(y.size):  # one logarithm for several variances: their product stays far from the ends of the range
-        scale *= var[j] + extra[j] if y[j] == y[j] else 1.0
-        if not 1e-140 < scale < 1e140:
-            l += math.log(scale)
-            scale = 1.0
-    return c, l + math.log(scale)
+    for j in range(y.size):
+        l += log(var[j] + extra[j]) if y[j] == y[j] else 0.0
+    return c, l
 
 
 _misfit_part = jit.part(_misfit, fastmath=jit.FAST)
