@@ -69,7 +69,8 @@ def validate(
     for pixel in pixels:
         found = fit(
             _one(job.samples, readings[pixel], None if u is None else u[pixel]), job.model, free=job.free,
-            fix=dict(job.fix), priors=dict(job.priors), shared=job.shared, seed=1, discrepancy=job.discrepancy, chain=True, rule=rule,
+            fix=dict(job.fix), priors=dict(job.priors), shared=job.shared, seed=1, discrepancy=job.discrepancy,
+            chain=True, rule=rule,
         )  # fmt: skip
         summary = found.summary()
         mean, sd = (np.array([summary[name][key] for name in estimates.names]) for key in ("mean", "sd"))
