@@ -40,6 +40,10 @@ _MOTION_SLACK_COUNTS = 4.0
 _TOP_SPEED_COUNTS_S = 8000.0  # 117 rev/min, beyond every X-series servo
 
 
+class RefusedError(DeviceError):
+    """A servo answered with an error number."""
+
+
 class Member(Protocol):
     """What the bus must know of a servo to stop it."""
 
@@ -48,6 +52,10 @@ class Member(Protocol):
 
     def clip(self, counts: int) -> int:
         """Nearest position that the servo's own limits accept."""
+        ...
+
+    def disarm(self) -> None:
+        """Its watchdog off: one that has tripped takes no goal before."""
         ...
 
     def halted(self, goal: int) -> None:
@@ -344,6 +352,8 @@ class Bus:
         """Tell one servo to hold where it is; True if it said that it does."""
         member = self._members[servo_id]
         try:
+            if not hasty:
+                member.disarm()
             goal = member.clip(self.block(servo_id, hasty=hasty).position)
             self.write(servo_id, GOAL_POSITION, goal, hasty=hasty)
         except DeviceError as error:
@@ -359,7 +369,7 @@ class Bus:
     def _refuse(self, servo_id: int, what: str, error: int) -> None:
         if error & 0x7F:
             reason = STATUS_ERRORS.get(error & 0x7F, f"unknown error {error & 0x7F}")
-            raise DeviceError(
+            raise RefusedError(
                 f"{self.label(servo_id)} refused {what}: {reason}"
                 f"{', and it reports a hardware error' if error & 0x80 else ''}; "
                 "check its model, operating mode and limits in rig.toml."

@@ -169,9 +169,9 @@ class Line:
                 self._port.timeout_s = self.timeout_s
                 if hasty:
                     self._port.timeout_s = min(self.timeout_s, _HASTY_TIMEOUT_S)
-                elif servo_id in self._owing and not self._fence(servo_id):
-                    break
                 try:
+                    if not hasty and servo_id in self._owing and not self._fence(servo_id):
+                        break
                     started()
                     result, data, error = self._exchange(servo_id, instruction, parameters, length)
                 except PortLostError:
@@ -291,15 +291,28 @@ class Line:
         return bytes(packet[PARAMETERS_AT : PARAMETERS_AT + count]), error
 
     def _fence(self, servo_id: int) -> bool:
-        """Drain; then True once the servo answers a question that no earlier one can have been."""
+        """Drain; then True once the servo answers a question that no earlier one can have been.
+
+        The others that owe an answer are fenced after the same drain: in a move each of them has to hear something in time,
+        or its watchdog stops it.
+        """
         for _ in range(self.attempts):
             self._drain()
-            self._fences += 1
-            length = _FENCE_LENGTHS[self._fences % len(_FENCE_LENGTHS)]
-            parameters = (0).to_bytes(2, "little") + length.to_bytes(2, "little")
-            result, data, error = self._exchange(servo_id, INST_READ, parameters, length)
-            if result == COMM_SUCCESS and not error & 0x7F and data[_ID_ADDRESS] == servo_id:
+            if self._fenced(servo_id):
+                for other in sorted(self._owing - self.failing):
+                    self._fenced(other)
                 return True
+        return False
+
+    def _fenced(self, servo_id: int) -> bool:
+        """One try of a question with an answer of a length of its own."""
+        self._fences += 1
+        length = _FENCE_LENGTHS[self._fences % len(_FENCE_LENGTHS)]
+        parameters = (0).to_bytes(2, "little") + length.to_bytes(2, "little")
+        result, data, error = self._exchange(servo_id, INST_READ, parameters, length)
+        if result == COMM_SUCCESS and not error & 0x7F and data[_ID_ADDRESS] == servo_id:
+            return True
+        self._owing.add(servo_id)
         return False
 
     def _drain(self) -> None:

@@ -16,7 +16,7 @@ import math
 from typing import Literal
 
 from drivers.dynamixel import registers as reg
-from drivers.dynamixel.bus import Bus
+from drivers.dynamixel.bus import Bus, RefusedError
 from drivers.dynamixel.commissioning import commission, torque_on
 from drivers.dynamixel.joint import Joint
 from drivers.dynamixel.leg import Leg, Outcome
@@ -301,10 +301,7 @@ class Servo:
         except DeviceError as error:
             logger.warning("axis %s: cannot be stopped after its stall: %s", self.name, error)
         if tripped:
-            raise DeviceError(
-                f"{self._label} was stopped by its own watchdog at {self._at(block.position)} on the way to "
-                f"{self._at(goal)}: the computer was silent too long; raise watchdog_s and resume."
-            )
+            raise self._barked(block)
         if outcome is Outcome.STRAINED:
             raise DeviceError(
                 f"{self._label} draws {abs(current):.2f} A at {self._at(block.position)} on the way to {self._at(goal)}, "
@@ -370,6 +367,10 @@ class Servo:
         """Nearest position within the limits [counts]."""
         return self._joint.clip(counts)
 
+    def disarm(self) -> None:
+        """Watchdog off; one that has tripped takes no goal before."""
+        self._watchdog.disarm()
+
     def halted(self, goal: int) -> None:
         """The servo was told to hold `goal` [counts]; the move is off."""
         self._one_sided = self._engaged = False
@@ -393,7 +394,18 @@ class Servo:
         return self._bus.read(self._id, register)
 
     def _send_goal(self, counts: int) -> None:
-        self._bus.command(self._id, reg.GOAL_POSITION, counts)
+        try:
+            self._bus.command(self._id, reg.GOAL_POSITION, counts)
+        except RefusedError:
+            if not self._watchdog.tripped():
+                raise
+            raise self._barked(self._bus.block(self._id)) from None
+
+    def _barked(self, block: reg.Block) -> DeviceError:
+        return DeviceError(
+            f"{self._label} was stopped by its own watchdog at {self._at(block.position)}: it heard nothing for too long, "
+            "from a busy computer or over a bad line; raise watchdog_s and resume."
+        )
 
     def _healthy(self, block: reg.Block) -> None:
         if block.alert:

@@ -183,11 +183,43 @@ def test_a_lost_middle_answer_is_asked_for_again(bench: Bench) -> None:
     assert {k: block.position for k, block in blocks.items()} == {1: 1800, 2: 2000, 3: 2200}
     assert rig.bus.timeouts == 1
     single = [(k, i) for k, i in rig.tap.seen() if i == READ]
-    assert single == [(2, READ), (2, READ), (3, READ), (3, READ)]  # each fenced by one of another length
+    assert single == [(2, READ), (1, READ), (3, READ), (2, READ), (3, READ)]  # all three are fenced, two asked again
     rig.bus.blocks([1, 2, 3])
-    assert (254, SYNC_READ) not in rig.tap.seen()  # the first owes nothing, but nothing is sure after such a cycle
-    rig.bus.blocks([1, 2, 3])
-    assert rig.tap.seen()[0] == (254, SYNC_READ)
+    assert rig.tap.seen() == [(254, SYNC_READ), (1, 0x55), (2, 0x55), (3, 0x55)]
+
+
+def test_no_watchdog_trips_while_a_bad_answer_is_dealt_with(bench: Bench) -> None:
+    rig = bench(watchdog_s=1.0)
+    rig.group.move_to({"arm": 80 * DEG, "pan": 70 * DEG, "tilt": 60 * DEG})
+    rig.clock.sleep(0.1)
+    rig.tap.line.inject(Fault("delay", servo_id=3, at_reply=rig.replies(3) + 1, delay_s=0.7))
+    rig.finish()
+    assert rig.bus.timeouts == 1
+    assert rig.shaft(2) == pytest.approx(2048 + 4096 * 70 / 360, abs=6)
+
+
+def test_a_stop_reaches_axes_whose_watchdog_has_tripped(bench: Bench) -> None:
+    rig = bench(watchdog_s=1.0)
+    rig.group.move_to({"arm": 90 * DEG, "pan": 90 * DEG})
+    rig.clock.sleep(1.5)  # the computer is busy with something else
+    assert [rig.bus.read(k, reg.BUS_WATCHDOG) for k in (1, 2, 3)] == [-1, -1, 0]
+    rig.bus.stop_all()
+    assert [rig.bus.read(k, reg.BUS_WATCHDOG) for k in (1, 2, 3)] == [0, 0, 0]
+    for k in (1, 2):
+        assert rig.bus.read(k, reg.GOAL_POSITION) == pytest.approx(rig.shaft(k), abs=2)
+        assert rig.bus.read(k, reg.PROFILE_VELOCITY) == 43  # the next move is no jerk
+
+
+def test_a_goal_that_a_tripped_watchdog_refuses_says_why(bench: Bench) -> None:
+    rig = bench(watchdog_s=1.0)
+    rig.group.move_to({"arm": -30 * DEG})  # from above: by way of a place below the goal
+    while rig.bus.block(1).in_motion:
+        rig.clock.sleep(0.02)
+    rig.clock.sleep(1.5)
+    with pytest.raises(DeviceError, match=r"Axis arm .* was stopped by its own watchdog at -3\d\.\d\d deg"):
+        for _ in range(10):
+            rig.clock.sleep(0.02)
+            rig.group.settled(["arm"])
 
 
 def test_a_silent_middle_axis_is_named(bench: Bench) -> None:
