@@ -10,9 +10,9 @@ Smith's masking sees an area of just 1,
 
 .. math:: 1 - E = \frac1{\mu_r}\int D(h)\,(\omega_r\cdot h)\,(G_1(\omega_r) - G_2)\,\mathrm{d}\omega_h ,
 
-whose integrand is positive, so that the small losses of smooth surfaces keep their digits. Rings of equal theta_h are split
-where they reach the horizon, touch it or leave it; between, and along the rings, nodes crowd double-exponentially towards
-these places [2]_, where the integrand has layers as thin as alpha and mu_r.
+whose integrand is positive, so that the small losses of smooth surfaces keep their digits; so does a table of ln(1 - E).
+Rings of equal theta_h are split where they reach the horizon, touch it or leave it; between, and along the rings, nodes crowd
+double-exponentially towards these places [2]_, where the integrand has layers as thin as alpha and mu_r.
 
 References
 ----------
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf import pieces
-from gonio.brdf.elementary import log
+from gonio.brdf.elementary import exp, log
 from gonio.brdf.facets import Facets
 from gonio.brdf.pieces import read as read_pieces
 
@@ -48,14 +48,13 @@ def lost(facets: Facets, at: int) -> Any:
     def loss(mu, s2, p):  # type: ignore[no-untyped-def]
         # pieces of ln((mu + near) / (s + tip))
         x = log((mu * p[at + 1] + 1.0) * (1.0 + tip) / (math.sqrt(s2) + tip)) * p[at + 2]
-        value = read_pieces(x, p, at + 3, count)
-        return value if value > 0.0 else 0.0  # smooth surfaces lose less than the table's rounding
+        return exp(read_pieces(x, p, at + 3, count))
 
     return jit.model(loss)
 
 
 def derived(facets: Facets, shadowing: str, average: float, p: Array, at: int) -> Array:
-    """Weight of the product of losses, two scales of the table's argument, and the table of 1 - E.
+    """Weight of the product of losses, two scales of the table's argument, and the table of ln(1 - E).
 
     Parameters
     ----------
@@ -75,16 +74,22 @@ def derived(facets: Facets, shadowing: str, average: float, p: Array, at: int) -
     _losses(facets.density(at), facets.hidden(at), shadowing == "smith", facets.pointed)(
         mu, s, p, facets.steep(p), *rules(facets.pointed), found
     )
-    table = pieces.table(found.reshape(count, -1))
+    table = pieces.table(_logarithm(found.reshape(count, -1)))
     # the mean of 1 - E: 2 mu dmu of the table, with dx = dmu / (mu + near) - ds / (s + tip)
     g, w = np.polynomial.legendre.leggauss(24)
     x = (np.arange(count)[:, None] + 0.5 * (1.0 + g)) * (span / count)
     mu, s = _angles(x, span, near, tip)
-    rows = np.polynomial.polynomial.polyval(g, table.reshape(count, -1).T)
+    rows = np.exp(np.polynomial.polynomial.polyval(g, table.reshape(count, -1).T))
     slope = mu * s / (s / (mu + near) + mu / (s + tip))
     loss = float(np.sum(rows * w * slope) * (span / count))
     weight = average * average * (1.0 - loss) / (1.0 - average * loss) / (math.pi * loss)
     return np.concatenate(([weight, 1.0 / near, count / span], table))
+
+
+def _logarithm(losses: Array) -> Array:
+    """ln(1 - E) at the nodes of pieces; -800, of which the exponential is 0, for pieces in which any loss is too small."""
+    seen = np.all(losses > 1e-290, axis=1, keepdims=True)
+    return np.where(seen, np.log(np.where(seen, losses, 1.0)), -800.0)
 
 
 def _angles(x: Array, span: float, near: float, tip: float) -> tuple[Array, Array]:

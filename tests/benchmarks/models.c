@@ -391,7 +391,7 @@ MODEL(microfacet_gtr)
 /* p: k_s, alpha, f_0, then weight, two scales and the table of 1 - E over ln((mu + near) / (s + tip)), tip = 0.05 */
 INLINE lost(double mu, double s2, const double *restrict p)
 {
-    return pieces(log((mu * p[4] + 1.0) * 1.05 / (sqrt(s2) + 0.05)) * p[5], p + 6, 30);
+    return exp(pieces(log((mu * p[4] + 1.0) * 1.05 / (sqrt(s2) + 0.05)) * p[5], p + 6, 30));
 }
 
 MODEL(microfacet_multiple_scattering)
