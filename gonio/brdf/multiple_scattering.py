@@ -11,8 +11,8 @@ Smith's masking sees an area of just 1,
 .. math:: 1 - E = \frac1{\mu_r}\int D(h)\,(\omega_r\cdot h)\,(G_1(\omega_r) - G_2)\,\mathrm{d}\omega_h ,
 
 whose integrand is positive, so that the small losses of smooth surfaces keep their digits; so does a table of ln(1 - E).
-Rings of equal theta_h are split where they reach the horizon, touch it or leave it; between, and along the rings, nodes crowd
-double-exponentially towards these places [2]_, where the integrand has layers as thin as alpha and mu_r.
+Rings of equal theta_h are split where they reach the horizon, touch it or leave it; between, and along the rings, nodes
+crowd double-exponentially towards these places [2]_, where the integrand has layers as thin as alpha and mu_r.
 
 References
 ----------
