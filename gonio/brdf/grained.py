@@ -19,7 +19,7 @@ A reflectance map of it needs `tangent=`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,12 +105,26 @@ GRAINED = Model(
 )
 
 
-def node_directions(shape: tuple[int, int, int, int], scale: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Directions (*shape, 3) of the nodes, those beyond the horizon moved up to one degree above it, and which these are."""
+def check_shape(shape: tuple[int, ...]) -> None:
+    """Refuse a table that cannot be interpolated or that would fill the memory."""
+    if len(shape) != 4 or min(shape) < 4 or shape[0] % 2 or math.prod(int(n) for n in shape) > 20_000_000:
+        raise DatasetError(
+            f"a table of shape {tuple(shape)} cannot be used: give an even number of phi_h, at least 4 nodes of each angle "
+            "and at most 20 million together"
+        )
+
+
+def nodes(shape: tuple[int, int, int, int], scale: float) -> tuple[Array, Array, Array, Array]:
+    """Node angles phi_h, theta_h, theta_d, phi_d [rad]; phi_d in [0, pi)."""
+    check_shape(shape)
     n_q, n_h, n_d, n_p = shape
     phi_h, phi_d = 2 * np.pi * np.arange(n_q) / n_q, np.pi * np.arange(n_p) / n_p
-    theta_h, theta_d = 2 * np.arctan(tangents(n_h, scale)), 2 * np.arctan(np.linspace(0.0, 1.0, n_d))
-    q, h, d, p = np.meshgrid(phi_h, theta_h, theta_d, phi_d, indexing="ij")
+    return phi_h, 2 * np.arctan(tangents(n_h, scale)), 2 * np.arctan(np.linspace(0.0, 1.0, n_d)), phi_d
+
+
+def node_directions(shape: tuple[int, int, int, int], scale: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Directions (*shape, 3) of the nodes, those beyond the horizon moved up to one degree above it, and which these are."""
+    q, h, d, p = np.meshgrid(*nodes(shape, scale), indexing="ij")
     lowest = math.sin(math.radians(1.0))
 
     def height(s: Array) -> Array:
@@ -138,11 +152,19 @@ class GrainedTable:
     scale: float = tabulated.SCALE
 
     def __post_init__(self) -> None:
-        shape = self.value.shape
-        if len(shape) != 4 or min(shape) < 4 or shape[0] % 2 or math.prod(shape) > 20_000_000:
-            raise DatasetError(f"a table of shape {shape} cannot be used: give an even number of phi_h and 4 nodes at least")
-        if not np.all(np.isfinite(self.value)) or np.any(self.value < 0):
-            raise DatasetError("table: a value is negative or not finite; the file is damaged")
+        check_shape(self.value.shape)
+        tangents(self.value.shape[1], self.scale)
+        tabulated.check_values(self.value, self.u, self.coverage)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Number of nodes along phi_h, theta_h, theta_d, phi_d."""
+        n_q, n_h, n_d, n_p = self.value.shape
+        return n_q, n_h, n_d, n_p
+
+    def nodes(self) -> tuple[Array, Array, Array, Array]:
+        """Node angles phi_h, theta_h, theta_d, phi_d [rad]."""
+        return nodes(self.shape, self.scale)
 
     def brdf(self) -> BRDF:
         """The table as a BRDF of one term."""
@@ -155,6 +177,12 @@ class GrainedTable:
     def counts(self) -> dict[str, int]:
         """Number of nodes by coverage."""
         return {name: int(np.count_nonzero(self.coverage == flag)) for flag, name in tabulated.COVERAGE.items()}
+
+    def samples(self) -> BRDFSamples:
+        """The nodes above the horizon as samples, without those that were extrapolated or taken from a model."""
+        omega_i, omega_r, _ = node_directions(self.shape, self.scale)
+        known = (self.coverage == tabulated.MEASURED) | (self.coverage == tabulated.INTERPOLATED)
+        return tabulated.plain_samples(omega_i[known], omega_r[known], self.value[known], self.u[known], self.attributes)
 
 
 def _packed(f: Array, scale: float) -> BRDF:
@@ -208,32 +236,71 @@ def coordinates(omega_i: Array, omega_r: Array) -> Array:
     )
 
 
-def tabulate(samples: BRDFSamples, shape: tuple[int, int, int, int] = SHAPE) -> GrainedTable:
+def shown_by(samples: BRDFSamples) -> bool:
+    """Whether samples show a grain: left out, they are predicted twice as well with the incident azimuth as without."""
+    if len(samples.f_r) < FEWEST or len(np.unique(np.round(samples.phi_i, 6))) < 3 or not np.any(samples.f_r > 0):
+        return False
+    some = samples.select(np.random.default_rng(0).permutation(len(samples.f_r))[: scattered.MANY])
+    u, known = scattered.working_uncertainty(some.f_r, some.u_f_r)
+    omega_i, omega_r = some.omega_i(), some.omega_r()
+    isotropic = scattered.Data(scattered.coordinates(omega_i, omega_r), some.f_r, u, known)
+    grained = _Grained(coordinates(omega_i, omega_r), some.f_r, u, known)
+    errors = [scattered.left_out_error(data, scattered.choose(data)[0]) for data in (isotropic, grained)]
+    return errors[1] < 0.25 * errors[0]  # squares
+
+
+def tabulate(
+    samples: BRDFSamples,
+    shape: tuple[int, int, int, int] = SHAPE,
+    *,
+    fill: BRDF | None = None,
+    scale: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GrainedTable:
     """A table from scattered samples of a material with a grain, at least 60.
 
     Every node is the local regression of its neighbours; beyond them it is a straight line with an uncertainty that grows
-    with the distance, flagged ``extrapolated``.
+    with the distance, flagged ``extrapolated``. `fill`, `scale` and `progress` as of `gonio.brdf.tabulated.tabulate`.
     """
     f = samples.f_r
     if len(f) < FEWEST:
         raise DatasetError(f"a table with a grain needs at least {FEWEST} samples, there are {len(f)}; fit a model instead")
     if not np.any(f > 0):
         raise DatasetError(f"none of the {len(f)} samples is positive; check the dark frames and the quantity")
+    total = -(-math.prod(shape) // 2048) + 1
+
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
+    tell(0)
     u, known = scattered.working_uncertainty(f, samples.u_f_r)
     data = _Grained(coordinates(samples.omega_i(), samples.omega_r()), f, u, known)
-    settings, error_scale = scattered.choose(data)
-    spread = float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
+    settings, errors = scattered.choose(data)
+    tell(1)
+    spread = scale or float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
     omega_i, omega_r, below = node_directions(shape, spread)
     targets = coordinates(omega_i.reshape(-1, 3), omega_r.reshape(-1, 3))
     measured = np.zeros(shape, dtype=bool)
     measured[_nearest_nodes(samples.omega_i(), samples.omega_r(), shape, spread)] = True
-    eta, sigma, far = scattered.at_nodes(data, settings, error_scale, targets, measured.ravel(), lambda done: None)
-    value = np.exp(eta).reshape(shape)
-    coverage = np.where(far, tabulated.EXTRAPOLATED, tabulated.INTERPOLATED).astype(np.uint8).reshape(shape)
+    found = scattered.at_nodes(data, settings, errors, targets, measured.ravel(), lambda done: tell(1 + done))
+    eta, sigma, far = (x.reshape(shape) for x in found)
+    value, relative = np.exp(eta), np.sqrt(np.expm1(np.minimum(sigma, 2.0) ** 2))
+    coverage = np.where(far, tabulated.EXTRAPOLATED, tabulated.INTERPOLATED).astype(np.uint8)
     coverage[measured] = tabulated.MEASURED
+    if fill is not None:
+        value[far] = fill.evaluate(omega_i[far], omega_r[far])
+        relative[far] = scattered.misfit(fill, samples, known)
+        coverage[far] = tabulated.MODEL
     coverage[below] = tabulated.BELOW_HORIZON
-    relative = np.sqrt(np.expm1(np.minimum(sigma, 2.0) ** 2)).reshape(shape)
-    attributes = {**samples.attributes, "quantity": "brdf", "n_samples": str(len(samples)), "grain": "phi_h = 0 along x"}
+    attributes = {
+        **samples.attributes,
+        "quantity": "brdf",
+        "n_samples": str(len(samples)),
+        "grain": "phi_h = 0 along x",
+        "fill": "none" if fill is None else repr(fill),
+        "uncertainty": "k = 1; random errors, scatter and interpolation; shared errors are not included",
+    }
     return GrainedTable(value, value * relative, coverage, attributes, spread)
 
 

@@ -89,6 +89,7 @@ def regress(
     *,
     fill: BRDF | None,
     shape: tuple[int, int, int],
+    scale: float | None,
     progress: Callable[[int, int], None] | None,
 ) -> tabulated.TabulatedBRDF:
     """Table of the samples; `gonio.brdf.tabulated.tabulate` says what goes in and out."""
@@ -108,14 +109,14 @@ def regress(
 
     tell(0)
     some = np.random.default_rng(0).permutation(len(f))[:MANY]
-    settings, scale = choose(Data(x[some], f[some], u[some], known))
+    settings, errors = choose(Data(x[some], f[some], u[some], known))
     # nodes as dense as the lobe is narrow
-    spread = float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
+    spread = scale or float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
     position = grid_position(omega_i, omega_r, shape, spread)
     data = Data(x, f, u, known)
     if len(f) > MANY:
         data = Data(*_binned(x, f, u, position, shape), known)
-        settings, scale = choose(data)
+        settings, errors = choose(data)
     tell(4)
     node_i, node_r, below = tabulated.node_directions(shape, spread)
     targets = coordinates(node_i.reshape(-1, 3), node_r.reshape(-1, 3))
@@ -125,7 +126,7 @@ def regress(
     # where azimuth has no meaning, one sample measures the node at all of them
     measured[0] |= measured[0].any(axis=-1, keepdims=True)
     measured[:, 0] |= measured[:, 0].any(axis=-1, keepdims=True)
-    eta, sigma, far = at_nodes(data, settings, scale, targets, measured.ravel(), lambda done: tell(4 + done))
+    eta, sigma, far = at_nodes(data, settings, errors, targets, measured.ravel(), lambda done: tell(4 + done))
     # standard deviation of a log-normal value over its median's: what is badly known may be far above
     sigma = np.minimum(sigma, 2.0)
     eta, relative_u = eta.reshape(shape), np.sqrt(np.expm1(sigma**2)).reshape(shape)
@@ -136,7 +137,7 @@ def regress(
     coverage[measured] = tabulated.MEASURED
     if fill is not None:
         value[far] = fill.evaluate(node_i[far], node_r[far])
-        relative_u = np.where(far, _misfit(fill, samples, known), relative_u)
+        relative_u = np.where(far, misfit(fill, samples, known), relative_u)
         coverage[far] = tabulated.MODEL
     coverage[below] = tabulated.BELOW_HORIZON
     attributes = {
@@ -145,7 +146,7 @@ def regress(
         "n_samples": str(len(samples)),
         "regression": (
             f"ln f local polynomial of order {settings.order} over {settings.neighbours} neighbours, "
-            f"lobe scale c = {settings.c:g}, error scale {scale:.3g}"
+            f"lobe scale c = {settings.c:g}, error scale {errors:.3g}"
         ),
         "fill": "none" if fill is None else repr(fill),
         "uncertainty": "k = 1; random errors, scatter and interpolation; shared errors are not included",
@@ -287,27 +288,29 @@ def _solve(design: Array, precision: Array, response: Array) -> tuple[Array, Arr
     return both[..., 0], both[..., 1]
 
 
+def left_out(data: Data) -> NDArray[np.int64]:
+    """The samples that are left out, one at a time, to judge settings."""
+    n = len(data.f)
+    return np.unique(np.linspace(0, n - 1, min(n, TRIALS)).astype(np.int64))
+
+
+def left_out_error(data: Data, settings: Settings) -> float:
+    """Mean square of the relative leave-one-out residuals, each at most a half."""
+    which = left_out(data)
+    f, noise = data.f[which], data.u[which] if data.known else 0.0
+    mu = np.exp(data.fit(data.x[which], settings, which).eta)
+    r = 2.0 * (f - mu) / (np.abs(f) + mu + 2.0 * noise + data.floor)
+    return float(np.mean(np.minimum(np.abs(r), 0.5) ** 2))
+
+
 def choose(data: Data) -> tuple[Settings, float]:
     """Settings with the smallest leave-one-out error, one coordinate at a time, and the scale of the standard errors."""
     n = len(data.f)
-    left_out = np.unique(np.linspace(0, n - 1, min(n, TRIALS)).astype(np.int64))
-    f, u = data.f[left_out], data.u[left_out]
-    noise = u if data.known else 0.0 * u
-
-    def residual(settings: Settings) -> tuple[Array, Local]:
-        local = data.fit(data.x[left_out], settings, left_out)
-        mu = np.exp(local.eta)
-        return 2.0 * (f - mu) / (np.abs(f) + mu + 2.0 * noise + data.floor), local
-
-    def error(settings: Settings) -> float:
-        r, _ = residual(settings)
-        return float(np.mean(np.minimum(np.abs(r), 0.5) ** 2))
-
     # a lobe narrower than the samples resolve would be a spike of our own making
     near = np.sort(data.tangent()[data.tangent() > 1e-6])
     finest = 0.5 * float(near[min(4, len(near) - 1)]) if len(near) else 1.0
     best = Settings(c=max(0.1, finest), neighbours=min(12, n - 1))
-    least = error(best)
+    least = left_out_error(data, best)
     orders = [(1, 8), (1, 20), (2, 16), (2, 24), (2, 40), (2, 64)]
     ladder: list[dict[str, list[float]] | list[tuple[int, int]]] = [
         {"c": [0.001, 0.003, 0.01, 0.03, 0.3, 1.0]},
@@ -324,12 +327,13 @@ def choose(data: Data) -> tuple[Settings, float]:
             pairs = [(name, v) for name, values in rung.items() for v in values if name != "c" or v >= finest]
             options = [replace(best, **{name: value}) for name, value in pairs]  # type: ignore[arg-type]
         for option in options:
-            if option != best and (e := error(option)) < 0.995 * least:
+            if option != best and (e := left_out_error(data, option)) < 0.995 * least:
                 best, least = option, e
 
     # scale of the standard errors: two thirds of the leave-one-out residuals within one of them
-    _, local = residual(best)
-    mu = np.exp(local.eta)
+    which = left_out(data)
+    local = data.fit(data.x[which], best, which)
+    f, noise, mu = data.f[which], data.u[which] if data.known else 0.0, np.exp(local.eta)
     deviation = np.abs(f - mu)
     inside = local.outside < OUTSIDE
     if np.count_nonzero(inside) < FEWEST:
@@ -397,7 +401,7 @@ def _binned(x: Array, f: Array, u: Array, position: Array, shape: tuple[int, int
     return np.stack(columns, axis=-1), mean_f, 1.0 / np.sqrt(mean_weight * count)
 
 
-def _misfit(fill: BRDF, samples: BRDFSamples, known: bool) -> float:
+def misfit(fill: BRDF, samples: BRDFSamples, known: bool) -> float:
     """Relative standard uncertainty of a fitted model off the samples: twice its robust misfit on them."""
     predicted = fill.evaluate(samples.omega_i(), samples.omega_r())
     deviation = np.abs(samples.f_r - predicted)

@@ -193,6 +193,28 @@ def check_shape(shape: tuple[int, ...]) -> None:
         )
 
 
+def check_values(value: Array, u: Array, coverage: NDArray[np.uint8]) -> None:
+    """Refuse numbers that no table has: negative, not finite, flags unknown, shapes that differ."""
+    for name, array in (("u", u), ("coverage", coverage)):
+        if array.shape != value.shape:
+            raise DatasetError(f"table: {name} has shape {array.shape}, value has {value.shape}")
+    if not np.all(np.isfinite(value)) or np.any(value < 0):
+        raise DatasetError("table: a value is negative or not finite; the file is damaged")
+    if np.any(u < 0) or np.any(np.isinf(u)):
+        raise DatasetError("table: an uncertainty is negative or infinite; the file is damaged")
+    if np.any(coverage > max(COVERAGE)):
+        raise DatasetError(f"table: coverage {int(coverage.max())} is unknown; known are 0 to {max(COVERAGE)}")
+
+
+def plain_samples(omega_i: Array, omega_r: Array, value: Array, u: Array, attributes: Mapping[str, str]) -> BRDFSamples:
+    """Nodes (n,) at pairs of directions (n, 3) as samples, without those at the horizon."""
+    theta_i, theta_r = (np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]) for w in (omega_i, omega_r))
+    phi_i, phi_r = (np.mod(np.arctan2(w[:, 1], w[:, 0]), 2 * np.pi) for w in (omega_i, omega_r))
+    keep = (theta_i < np.pi / 2) & (theta_r < np.pi / 2)
+    at = theta_i[keep], phi_i[keep], theta_r[keep], phi_r[keep]
+    return BRDFSamples.plain(*at, value[keep], u[keep], attributes=dict(attributes))
+
+
 def node_directions(shape: tuple[int, int, int] = SHAPE, scale: float = SCALE) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Directions at which the nodes stand.
 
@@ -251,15 +273,7 @@ class TabulatedBRDF:
     def __post_init__(self) -> None:
         check_shape(self.value.shape)
         tangents(self.value.shape[0], self.scale)
-        for name, array in (("u", self.u), ("coverage", self.coverage)):
-            if array.shape != self.value.shape:
-                raise DatasetError(f"table: {name} has shape {array.shape}, value has {self.value.shape}")
-        if not np.all(np.isfinite(self.value)) or np.any(self.value < 0):
-            raise DatasetError("table: a value is negative or not finite; the file is damaged")
-        if np.any(self.u < 0) or np.any(np.isinf(self.u)):
-            raise DatasetError("table: an uncertainty is negative or infinite; the file is damaged")
-        if np.any(self.coverage > max(COVERAGE)):
-            raise DatasetError(f"table: coverage {int(self.coverage.max())} is unknown; known are 0 to {max(COVERAGE)}")
+        check_values(self.value, self.u, self.coverage)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -305,27 +319,25 @@ class TabulatedBRDF:
         """The nodes above the horizon as samples, without those that were extrapolated or taken from a model."""
         omega_i, omega_r, _ = node_directions(self.shape, self.scale)
         known = (self.coverage == MEASURED) | (self.coverage == INTERPOLATED)
-        wi, wr = omega_i[known], omega_r[known]
-        theta_i, theta_r = (np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]) for w in (wi, wr))
-        phi_i, phi_r = (np.mod(np.arctan2(w[:, 1], w[:, 0]), 2 * np.pi) for w in (wi, wr))
-        keep = (theta_i < np.pi / 2) & (theta_r < np.pi / 2)
-        return BRDFSamples.plain(
-            theta_i[keep], phi_i[keep], theta_r[keep], phi_r[keep], self.value[known][keep], self.u[known][keep],
-            attributes=dict(self.attributes),
-        )  # fmt: skip
+        return plain_samples(omega_i[known], omega_r[known], self.value[known], self.u[known], self.attributes)
 
     def save(self, path: str | Path) -> None:
         """Write the table as NetCDF."""
-        from gonio.formats import netcdf
+        from gonio.brdf.tables import Tables
 
-        netcdf.write(Path(path), table=self)
+        Tables((self,)).save(path)
 
     @classmethod
     def load(cls, path: str | Path) -> TabulatedBRDF:
-        """Read a table from NetCDF; `DatasetError` if the file holds none."""
-        from gonio.formats import netcdf
+        """Read a table from NetCDF; `DatasetError` if the file holds none, or one with a grain or several channels."""
+        from gonio.brdf.tables import Tables
 
-        return netcdf.read_table(Path(path))
+        found = Tables.load(path)
+        if not isinstance(found.main, cls) or len(found.tables) > 1:
+            raise DatasetError(
+                f"{path} holds a table with a grain or several channels; read it with gonio.brdf.tables.Tables"
+            )
+        return found.main
 
 
 def _packed(f: Array, scale: float) -> BRDF:
@@ -358,6 +370,7 @@ def tabulate(
     *,
     fill: BRDF | None = None,
     shape: tuple[int, int, int] = SHAPE,
+    scale: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> TabulatedBRDF:
     """A table from scattered samples by local regression; see `gonio.brdf.scattered` for how.
@@ -371,6 +384,8 @@ def tabulate(
         nodes are extrapolated, flagged so, with a large uncertainty.
     shape : tuple of int
         Nodes along theta_h, theta_d, phi_d.
+    scale : float, optional
+        Of the nodes along theta_h; by default as dense as the samples show the lobe to be narrow.
     progress : callable, optional
         Called with (done, total).
 
@@ -382,4 +397,4 @@ def tabulate(
     from gonio.brdf.scattered import regress
 
     check_shape(shape)
-    return regress(samples, fill=fill, shape=shape, progress=progress)
+    return regress(samples, fill=fill, shape=shape, scale=scale, progress=progress)

@@ -43,7 +43,7 @@ def bundle(run: Path, out: Path, title: str, authors: tuple[str, ...], licence: 
     with speaking(as_json) as output, steps.open_run(run) as opened:
         if not opened.has_samples():
             raise DatasetError(f"{run} has no samples; run `gonio reduce {run}` first")
-        samples = opened.read_samples()
+        samples = steps.all_samples(opened)
         table = steps.load_table(opened) if opened.table_path.exists() else None
         report = steps.report(opened, output)
         part = out.with_name(f".{out.name}.{secrets.token_hex(4)}.part")

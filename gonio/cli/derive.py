@@ -27,12 +27,22 @@ def reduce(run: Path, as_json: bool) -> None:
 @click.command()
 @RUN
 @click.option("--fill", is_flag=True, help="Fill what was not measured from the fit; those nodes are flagged.")
+@click.option("--channel", help="One channel only, such as red, 550nm or luminance.")
 @json_option
-def table(run: Path, fill: bool, as_json: bool) -> None:
-    """Tabulate the samples of RUN over half and difference angles (table.nc)."""
+def table(run: Path, fill: bool, channel: str | None, as_json: bool) -> None:
+    """Tabulate the samples of RUN over half and difference angles (table.nc).
+
+    In all channels, and over four angles if the samples depend on the incident azimuth.
+    """
     with speaking(as_json) as output, steps.open_run(run) as opened:
-        made = steps.tabulate(opened, output, fill=steps.load_posterior(opened).brdf() if fill else None)
-        output.say(f"wrote {opened.table_path}: " + ", ".join(f"{n} nodes {k}" for k, n in made.counts().items()))
+        made = steps.tabulate(opened, output, fill=steps.load_posterior(opened).brdf() if fill else None, channel=channel)
+        if made.grained:
+            output.say(
+                "the samples depend on the incident azimuth: the table keeps the grain, a map of it needs rotation_deg"
+            )
+        of = f" in each of {len(made.channels)} channels" if len(made.channels) > 1 else ""
+        shown = ", ".join(f"{n} nodes {k}" for k, n in made.counts().items())
+        output.say(f"wrote {opened.table_path}: {shown}{of}")
 
 
 @click.command()

@@ -61,7 +61,7 @@ def convert(
     fitted to them (--model) where they are sparse.
     """
     from gonio import formats
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Tables
     from gonio.channels import ChannelSamples
     from gonio.formats import opticstudio
 
@@ -77,17 +77,17 @@ def convert(
             what = "the same grid, number for number"
         else:
             found = formats.read(file, quantity)
-            if isinstance(found, ChannelSamples) and channel is not None:
-                found = ChannelSamples.of(found.channel(channel))
+            if isinstance(found, Tables) and channel is not None:
+                found = found.one(channel)
             elif channel is not None:
-                raise ConfigurationError(f"{file} has one channel; leave --channel {channel} away")
-            samples = None if isinstance(found, TabulatedBRDF) else found
+                found = ChannelSamples.of(formats.one_channel(file, found, channel))
+            samples = None if isinstance(found, Tables) else found
             if form.writes == "grid" or (form.writes == "samples" and samples is None):
                 material = _material(output, found, model, attributes)
                 formats.export(name, out, material=material, attributes=attributes)
                 what = f"from a {material.attributes['origin']}"
             else:
-                table = found if isinstance(found, TabulatedBRDF) else None
+                table = found if isinstance(found, Tables) else None
                 formats.export(name, out, samples=samples, table=table, attributes=attributes)
                 what = "the samples as they are" if samples is not None else "the table as it is"
         output.say(f"wrote {out}: {form.doc}, {_quantity(form)}; {what}")
@@ -119,51 +119,26 @@ def check_file(file: Path, as_json: bool) -> None:
 def _material(output: Output, found: Any, model: str | None, attributes: dict[str, str]) -> Material:
     """What the grid formats are written from: the table of the file, a table of its samples, or a fitted model."""
     from gonio import formats
-    from gonio.brdf.tabulated import TabulatedBRDF, tabulate
+    from gonio.brdf import tables
     from gonio.channels import SINGLE, ChannelSamples
     from gonio.formats import Material
 
-    if isinstance(found, TabulatedBRDF):
-        made = formats.material_of(found, attributes=attributes)
-        assert made is not None
-        return made
-    several = isinstance(found, ChannelSamples)
-    sets = found.all_channels() if several else (found,)
-    channels = found.channels if several else SINGLE
-    _warn_of_holes(output, sets[0], model)
-    told = {**found.attributes, **attributes}
-    if model is not None:
-        from fitting import fit
+    if not isinstance(found, tables.Tables):
+        several = isinstance(found, ChannelSamples)
+        sets = found.all_channels() if several else (found,)
+        _warn_of_holes(output, sets[0], model)
+        if model is not None:
+            from fitting import fit
 
-        posteriors = [fit(one, model, seed=1) for one in sets]
-        return Material(
-            tuple(p.brdf() for p in posteriors), channels, attributes={**told, "origin": "model", "model": model}
-        )
-    if several and len({round(float(p), 6) for p in found.phi_i}) > 1 and _grained(found):
-        from gonio.brdf import grained
-
-        output.warn("the samples depend on the incident azimuth: the table keeps the grain")
-        with_grain = [grained.tabulate(one) for one in sets]
-        u = tuple(t.u_brdf() for t in with_grain)
-        return Material(tuple(t.brdf() for t in with_grain), channels, u, {**told, "origin": "table with a grain"})
-    tables = [tabulate(one) for one in sets]
-    return Material(
-        tuple(t.brdf() for t in tables), channels, tuple(t.u_brdf() for t in tables), {**told, "origin": "table"}
-    )
-
-
-def _grained(found: Any) -> bool:
-    """Whether a turn of both directions about the normal changes f_r by more than 20 % for most pairs so related."""
-    import numpy as np
-
-    key = np.round(np.stack((found.theta_i, found.theta_r, np.cos(found.phi_r - found.phi_i)), axis=-1), 5)
-    _, index, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    value = found.f_r[:, found.channels.main]
-    order = np.argsort(index.ravel(), kind="stable")
-    starts = np.concatenate(([0], np.cumsum(count)[:-1]))
-    low, high = np.minimum.reduceat(value[order], starts), np.maximum.reduceat(value[order], starts)
-    several = (count > 1) & (high > 0)
-    return bool(np.any(several) and np.median((high - low)[several] / high[several]) > 0.2)
+            told = {**found.attributes, **attributes, "origin": "model", "model": model}
+            posteriors = [fit(one, model, seed=1) for one in sets]
+            return Material(tuple(p.brdf() for p in posteriors), found.channels if several else SINGLE, attributes=told)
+        found = tables.tabulate(found)
+        if found.grained:
+            output.warn("the samples depend on the incident azimuth: the table keeps the grain")
+    made = formats.material_of(found, attributes=attributes)
+    assert made is not None
+    return made
 
 
 def _warn_of_holes(output: Output, samples: BRDFSamples, model: str | None) -> None:

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gonio.cli.output import Output, log_to
-from gonio.errors import DatasetError
+from gonio.errors import ConfigurationError, DatasetError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from gonio.brdf.base import BRDF
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Tables
+    from gonio.channels import ChannelSamples
     from gonio.config import SceneConfig
     from gonio.integrate import MapValues
     from gonio.maps import ReflectanceMap
@@ -54,24 +55,37 @@ def reduce_run(run: Run, output: Output) -> BRDFSamples:
     return samples
 
 
-def tabulate(run: Run, output: Output, *, fill: BRDF | None = None) -> TabulatedBRDF:
-    """Samples to a table, written as table.nc."""
-    from gonio.brdf.tabulated import tabulate as make_table
+def all_samples(run: Run) -> BRDFSamples | ChannelSamples:
+    """The samples of a run, in all channels if it was imported from a file with several."""
+    from gonio import formats
 
+    return formats.read_channels(run.channels_path) if run.channels_path.exists() else run.read_samples()
+
+
+def tabulate(run: Run, output: Output, *, fill: BRDF | None = None, channel: str | None = None) -> Tables:
+    """Samples to tables of all channels or of one, written as table.nc."""
+    from gonio.brdf.tables import tabulate as make_tables
+    from gonio.channels import ChannelSamples
+
+    samples = all_samples(run)
+    if channel is not None:
+        if not isinstance(samples, ChannelSamples):
+            raise ConfigurationError(f"{run.path} has one channel; leave --channel {channel} away")
+        samples = samples.channel(channel)
     with output.stage("tabulate") as progress:
-        table = make_table(run.read_samples(), fill=fill, progress=progress)
-        table.save(run.table_path)
-    output.result(table=run.table_path, coverage=table.counts())
-    return table
+        tables = make_tables(samples, fill=fill, progress=progress)
+        tables.save(run.table_path)
+    output.result(table=run.table_path, coverage=tables.counts(), channels=tables.channels.names, grain=tables.grained)
+    return tables
 
 
-def load_table(run: Run) -> TabulatedBRDF:
-    """The table of a run."""
-    from gonio.brdf.tabulated import TabulatedBRDF
+def load_table(run: Run) -> Tables:
+    """The tables of a run."""
+    from gonio.brdf.tables import Tables
 
     if not run.table_path.exists():
         raise DatasetError(f"{run.path} has no table yet; make it with: gonio table {run.path}")
-    return TabulatedBRDF.load(run.table_path)
+    return Tables.load(run.table_path)
 
 
 def load_posterior(run: Run) -> Posterior:
@@ -234,7 +248,7 @@ def export(run: Run, name: str, path: Path, output: Output) -> None:
     from gonio import formats
     from gonio.formats.quantity import SHORT
 
-    samples = run.read_samples() if run.has_samples() else None
+    samples = all_samples(run) if run.has_samples() else None
     table = load_table(run) if run.table_path.exists() else None
     posterior = load_posterior(run) if run.posterior_path.exists() else None
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -256,7 +270,7 @@ def export(run: Run, name: str, path: Path, output: Output) -> None:
 
 
 def _warn_of_coverage(
-    output: Output, samples: BRDFSamples | None, table: TabulatedBRDF | None, posterior: Posterior | None
+    output: Output, samples: BRDFSamples | ChannelSamples | None, table: Tables | None, posterior: Posterior | None
 ) -> None:
     """Say what of a file that holds every direction was not measured."""
     if table is not None:

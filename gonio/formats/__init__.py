@@ -42,9 +42,20 @@ from gonio.samples import BRDFSamples
 
 if TYPE_CHECKING:
     from gonio.brdf.base import BRDF
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Table, Tables
 
-__all__ = ["FORMATS", "Format", "Material", "export", "material_of", "read", "read_channels", "read_samples", "sniff"]
+__all__ = [
+    "FORMATS",
+    "Format",
+    "Material",
+    "export",
+    "material_of",
+    "one_channel",
+    "read",
+    "read_channels",
+    "read_samples",
+    "sniff",
+]
 
 Samples = BRDFSamples | ChannelSamples
 
@@ -166,7 +177,7 @@ def sniff(path: str | Path) -> str:
     raise DatasetError(f"{path} is in no format that gonio knows; {READ}")
 
 
-def read(path: str | Path, quantity: str | None = None) -> Samples | TabulatedBRDF:
+def read(path: str | Path, quantity: str | None = None) -> Samples | Tables:
     """Read a file of any known format.
 
     Parameters
@@ -177,8 +188,8 @@ def read(path: str | Path, quantity: str | None = None) -> Samples | TabulatedBR
 
     Returns
     -------
-    BRDFSamples, ChannelSamples or TabulatedBRDF
-        A table only from a NetCDF file that holds a table and no samples; samples of one channel with poses and shared
+    BRDFSamples, ChannelSamples or Tables
+        Tables only from a NetCDF file that holds no samples; samples of one channel with poses and shared
         errors only from NetCDF.
 
     Raises
@@ -202,7 +213,7 @@ def read_channels(path: str | Path, quantity: str | None = None) -> ChannelSampl
     found = read(path, quantity)
     if isinstance(found, ChannelSamples):
         return found
-    return ChannelSamples.of(found if isinstance(found, BRDFSamples) else found.samples())
+    return ChannelSamples.of(found) if isinstance(found, BRDFSamples) else found.samples()
 
 
 def read_samples(path: str | Path, quantity: str | None = None, channel: str | None = None) -> BRDFSamples:
@@ -216,22 +227,31 @@ def read_samples(path: str | Path, quantity: str | None = None, channel: str | N
         Name of a channel, such as ``"red"`` or ``"550nm"``; by default the luminance of RGB, Y of XYZ, and of a spectrum the
         wavelength nearest to 555 nm.
     """
-    found = read(path, quantity)
-    if isinstance(found, ChannelSamples):
-        return found.channel(channel)
+    return one_channel(path, read(path, quantity), channel)
+
+
+def one_channel(path: str | Path, found: Samples | Tables, channel: str | None = None) -> BRDFSamples:
+    """One channel of what `read` found in a file."""
+    if not isinstance(found, BRDFSamples):
+        return (found if isinstance(found, ChannelSamples) else found.samples()).channel(channel)
     if channel is not None:
         raise ConfigurationError(f"{path} has one channel; leave --channel {channel} away")
-    return found if isinstance(found, BRDFSamples) else found.samples()
+    return found
 
 
 def material_of(
-    table: TabulatedBRDF | None = None, brdf: BRDF | None = None, attributes: Mapping[str, str] | None = None
+    table: Table | Tables | None = None, brdf: BRDF | None = None, attributes: Mapping[str, str] | None = None
 ) -> Material | None:
-    """What grid formats are written from: the table, else the fitted BRDF; None if there is neither."""
+    """What grid formats are written from: the tables, else the fitted BRDF; None if there is neither."""
     if table is not None:
-        counts = ", ".join(f"{n} {k}" for k, n in table.counts().items())
-        told = {**table.attributes, "origin": "table", "coverage": counts, **(attributes or {})}
-        return Material((table.brdf(),), u=(table.u_brdf(),), attributes=told)
+        from gonio.brdf.tables import Tables
+
+        of = Tables.of(table)
+        counts = ", ".join(f"{n} {k}" for k, n in of.counts().items())
+        origin = "table with a grain" if of.grained else "table"
+        told = {**of.attributes, "origin": origin, "coverage": counts, **(attributes or {})}
+        u = tuple(t.u_brdf() for t in of.tables)
+        return Material(tuple(t.brdf() for t in of.tables), of.channels, u, told)
     if brdf is not None:
         return Material((brdf,), attributes={"origin": "model", "model": repr(brdf), **(attributes or {})})
     return None
@@ -242,7 +262,7 @@ def export(
     path: str | Path,
     *,
     samples: Samples | None = None,
-    table: TabulatedBRDF | None = None,
+    table: Table | Tables | None = None,
     brdf: BRDF | None = None,
     material: Material | None = None,
     attributes: Mapping[str, str] | None = None,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gonio import formats
+from gonio.brdf.tables import Tables
 from gonio.channels import ChannelSamples
 from gonio.errors import DatasetError
 from gonio.formats import klems, peers
@@ -106,7 +107,7 @@ def _xarray(path: Path, reader: str) -> Result:
             theirs = data["brdf" if "brdf" in data else "brdf_table"].values
     except (OSError, ValueError, KeyError) as error:
         raise DatasetError(f"xarray does not open {path}: {error}") from None
-    ours = found.value if hasattr(found, "value") else found.f_r
+    ours = np.stack([t.value for t in found.tables]).reshape(theirs.shape) if isinstance(found, Tables) else found.f_r
     return _differences(reader, f"of {theirs.size} values", float(np.abs(theirs - ours).max()), 0.0)
 
 

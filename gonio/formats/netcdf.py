@@ -3,9 +3,9 @@
 One root group. Samples have the dimension ``sample``: ``theta_i``, ``phi_i``, ``theta_r``, ``phi_r`` [rad], ``brdf``
 [sr-1] with ``brdf_standard_error``, and the derivatives with respect to each shared error. Several channels are a second
 dimension ``channel`` with ``channel_name`` and, for spectra, ``wavelength`` [nm]. A table has the dimensions ``theta_h``,
-``theta_d``, ``phi_d`` (and ``phi_h`` before them if it is anisotropic): ``brdf_table`` with its standard error and coverage
-flags. Either or both may be present. CF has no standard name for a BRDF, so ``long_name`` says it. Numbers come back bit for
-bit. docs/formats.md lists every variable.
+``theta_d``, ``phi_d``, before them ``phi_h`` if it has a grain and before all ``channel`` if it has several: ``brdf_table``
+with its standard error and coverage flags. Either or both may be present. CF has no standard name for a BRDF, so
+``long_name`` says it. Numbers come back bit for bit. docs/formats.md lists every variable.
 
 A file is opened by a child process under limits; see `gonio.formats.hdf5`.
 
@@ -20,20 +20,20 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
 import gonio
 from gonio import files
-from gonio.channels import Channels, ChannelSamples, from_names, spectral
+from gonio.channels import SINGLE, Channels, ChannelSamples, from_names, spectral
 from gonio.errors import DatasetError
 from gonio.formats import hdf5
 from gonio.formats.hdf5 import Contents
 from gonio.samples import BRDFSamples, SharedError
 
 if TYPE_CHECKING:
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Table, Tables
 
 CONVENTIONS = "CF-1.11 gonio-1"
 BRDF_NAME = "bidirectional reflectance distribution function"
@@ -47,6 +47,13 @@ DIRECTIONS = {
     "theta_r": "polar angle of reflection",
     "phi_r": "azimuth of reflection",
 }
+AXIS_NAMES = {
+    "phi_h": "azimuth of the half vector",
+    "theta_h": "polar angle of the half vector",
+    "theta_d": "polar angle of the difference vector",
+    "phi_d": "azimuth of the difference vector",
+}
+AXES = tuple(AXIS_NAMES)  # of a table with a grain; without one it has no phi_h
 
 
 def sniff(head: bytes) -> bool:
@@ -58,16 +65,16 @@ def write(
     path: Path,
     *,
     samples: BRDFSamples | ChannelSamples | None = None,
-    table: TabulatedBRDF | None = None,
+    table: Table | Tables | None = None,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write samples, a table or both.
+    """Write samples, tables or both; where both have several channels, these must be the same.
 
     Parameters
     ----------
     path : Path
     samples : BRDFSamples or ChannelSamples, optional
-    table : TabulatedBRDF, optional
+    table : TabulatedBRDF, GrainedTable or Tables, optional
     attributes : mapping of str to str, optional
         More about the file; ``history`` extends the file's own.
     """
@@ -76,6 +83,8 @@ def write(
 
     def put(temporary: Path) -> None:
         import h5netcdf
+
+        from gonio.brdf.tables import Tables
 
         with h5netcdf.File(temporary, "w") as file:
             given = dict(attributes or {})
@@ -90,24 +99,30 @@ def write(
             file.attrs["uncertainty"] = "standard uncertainty (k = 1); errors shared by all samples are listed apart"
             if given:
                 file.attrs["gonio_attributes"] = json.dumps(given, sort_keys=True)
+            tables = None if table is None else Tables.of(table)
+            named = [x.channels for x in (samples, tables) if isinstance(x, ChannelSamples) or _named(x)]
+            if len({channels.names for channels in named}) > 1:
+                raise DatasetError(f"{path}: samples and table have different channels; write them to two files")
+            if named:
+                _put_channels(file, named[0])
             if samples is not None:
                 _put_samples(file, samples)
-            if table is not None:
-                _put_table(file, table)
+            if tables is not None:
+                _put_tables(file, tables)
 
     files.replace_atomically(path, put)
 
 
 def contents(path: Path) -> set[str]:
-    """What the file holds: ``"samples"``, ``"table"`` or both."""
+    """What the file holds: ``"samples"``, ``"table"`` (one or several channels) or both."""
     found = hdf5.read(path)
     return {kind for kind, name in (("samples", "brdf"), ("table", "brdf_table")) if name in found.arrays}
 
 
-def read(path: Path) -> BRDFSamples | ChannelSamples | TabulatedBRDF:
-    """Samples if there are any, else the table."""
+def read(path: Path) -> BRDFSamples | ChannelSamples | Tables:
+    """Samples if there are any, else the tables."""
     found = hdf5.read(path)
-    return _table(path, found) if "brdf" not in found.arrays and "brdf_table" in found.arrays else _samples(path, found)
+    return _tables(path, found) if "brdf" not in found.arrays and "brdf_table" in found.arrays else _samples(path, found)
 
 
 def read_samples(path: Path) -> BRDFSamples:
@@ -116,9 +131,9 @@ def read_samples(path: Path) -> BRDFSamples:
     return found if isinstance(found, BRDFSamples) else found.channel()
 
 
-def read_table(path: Path) -> TabulatedBRDF:
-    """Table of a file that `write` made, or `DatasetError`."""
-    return _table(path, hdf5.read(path))
+def read_tables(path: Path) -> Tables:
+    """Tables of a file that `write` made, or `DatasetError`."""
+    return _tables(path, hdf5.read(path))
 
 
 def _samples(path: Path, file: Contents) -> BRDFSamples | ChannelSamples:
@@ -165,26 +180,55 @@ def _channels(path: Path, file: Contents) -> Channels:
     return from_names(tuple(_texts_of(path, file, "channel_name")), str(path))
 
 
-def _table(path: Path, file: Contents) -> TabulatedBRDF:
-    from gonio.brdf import tabulated
+def _tables(path: Path, file: Contents) -> Tables:
+    from gonio.brdf import grained, tabulated
+    from gonio.brdf.tables import Tables
 
     _needed(path, file, "brdf_table", "table")
     value = _array(path, file, "brdf_table")
     u = _array(path, file, "brdf_table_standard_error")
     coverage = _array(path, file, "brdf_table_coverage", kind="iu")
-    tabulated.check_shape(value.shape)
+    kind = grained if "phi_h" in file.arrays else tabulated
+    axes = AXES if kind is grained else AXES[1:]
+    channels = SINGLE
+    if value.ndim == len(axes) + 1:
+        channels = _channels(path, file)
+        if len(channels) != value.shape[0]:
+            raise DatasetError(f"{path}: {len(channels)} channels are named, brdf_table has {value.shape[0]}; it is damaged")
+    else:
+        value, u, coverage = value[None], u[None], coverage[None]
+    if u.shape != value.shape or coverage.shape != value.shape:
+        raise DatasetError(f"{path}: brdf_table, its standard error and its coverage have different shapes; it is damaged")
+    kind.check_shape(value.shape[1:])
     try:
         scale = float(file.attributes["brdf_table"].get("theta_h_scale", "nan"))
     except ValueError:
         scale = math.nan
-    for name, expected in zip(("theta_h", "theta_d", "phi_d"), tabulated.nodes(value.shape, scale), strict=True):
+    for name, expected in zip(axes, kind.nodes(value.shape[1:], scale), strict=True):
         axis = _array(path, file, name)
         if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
             raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
     attributes = _attributes(path, file, "brdf_table")
     if np.any((coverage < 0) | (coverage > 255)):
         raise DatasetError(f"{path}: a coverage flag is outside 0 to 255; the file is damaged")
-    return tabulated.TabulatedBRDF(value, u, coverage.astype(np.uint8), attributes, scale)
+    table = grained.GrainedTable if kind is grained else tabulated.TabulatedBRDF
+    flags = coverage.astype(np.uint8)
+    return Tables(tuple(table(*part, attributes, scale) for part in zip(value, u, flags, strict=True)), channels)
+
+
+def _named(tables: object) -> TypeGuard[Tables]:
+    """Whether they are tables with a dimension for their channels."""
+    from gonio.brdf.tables import Tables
+
+    return isinstance(tables, Tables) and tables.channels != SINGLE
+
+
+def _put_channels(file: Any, channels: Channels) -> None:
+    file.dimensions["channel"] = len(channels)
+    _texts(file, "channel_name", ("channel",), list(channels.names), long_name="name of the channel")
+    if channels.wavelengths_nm is not None:
+        waves = np.array(channels.wavelengths_nm)
+        _variable(file, "wavelength", ("channel",), waves, long_name="radiation wavelength", units="nm")
 
 
 def _put_samples(file: Any, samples: BRDFSamples | ChannelSamples) -> None:
@@ -192,11 +236,6 @@ def _put_samples(file: Any, samples: BRDFSamples | ChannelSamples) -> None:
     dimensions: tuple[str, ...] = ("sample",)
     if isinstance(samples, ChannelSamples):
         dimensions = ("sample", "channel")
-        file.dimensions["channel"] = len(samples.channels)
-        _texts(file, "channel_name", ("channel",), list(samples.channels.names), long_name="name of the channel")
-        if samples.channels.wavelengths_nm is not None:
-            waves = np.array(samples.channels.wavelengths_nm)
-            _variable(file, "wavelength", ("channel",), waves, long_name="radiation wavelength", units="nm")
     for name, long_name in DIRECTIONS.items():
         _variable(file, name, ("sample",), getattr(samples, name), long_name=long_name, units="rad")
     _variable(
@@ -234,27 +273,36 @@ def _put_samples(file: Any, samples: BRDFSamples | ChannelSamples) -> None:
         )  # fmt: skip
 
 
-def _put_table(file: Any, table: TabulatedBRDF) -> None:
+def _put_tables(file: Any, tables: Tables) -> None:
     from gonio.brdf.tabulated import COVERAGE
 
-    dimensions = ("theta_h", "theta_d", "phi_d")
-    names = ("polar angle of the half vector", "polar angle of the difference vector", "azimuth of the difference vector")
-    for name, size in zip(dimensions, table.shape, strict=True):
+    table = tables.main
+    axes = AXES if tables.grained else AXES[1:]
+    for name, size in zip(axes, table.shape, strict=True):
         file.dimensions[name] = size
-    for name, long_name, axis in zip(dimensions, names, table.nodes(), strict=True):
-        _variable(file, name, (name,), axis, long_name=f"{long_name} (Rusinkiewicz)", units="rad")
-    _variable(
-        file, "brdf_table", dimensions, table.value, long_name=BRDF_NAME, units="sr-1",
-        ancillary_variables="brdf_table_standard_error brdf_table_coverage",
-        comment="phi_d is folded into 0..pi/2: reciprocal and mirror-symmetric; beyond the horizon a continuation",
-        theta_h_scale=repr(float(table.scale)), gonio_attributes=json.dumps(dict(table.attributes), sort_keys=True),
+    for name, axis in zip(axes, table.nodes(), strict=True):
+        _variable(file, name, (name,), axis, long_name=f"{AXIS_NAMES[name]} (Rusinkiewicz)", units="rad")
+    several = _named(tables)
+    dimensions = (("channel",) if several else ()) + axes
+    value, u, coverage = (
+        np.stack([getattr(t, name) for t in tables.tables]) if several else getattr(table, name)
+        for name in ("value", "u", "coverage")
+    )
+    folded = "phi_d covers half a turn: reciprocal" if tables.grained else (
+        "phi_d is folded into 0..pi/2: reciprocal and mirror-symmetric"
     )  # fmt: skip
     _variable(
-        file, "brdf_table_standard_error", dimensions, table.u, units="sr-1",
+        file, "brdf_table", dimensions, value, long_name=BRDF_NAME, units="sr-1",
+        ancillary_variables="brdf_table_standard_error brdf_table_coverage",
+        comment=f"{folded}; beyond the horizon a continuation",
+        theta_h_scale=repr(float(table.scale)), gonio_attributes=json.dumps(dict(tables.attributes), sort_keys=True),
+    )  # fmt: skip
+    _variable(
+        file, "brdf_table_standard_error", dimensions, u, units="sr-1",
         long_name=f"standard uncertainty of the {BRDF_NAME}", comment="k = 1; shared errors are not included",
     )  # fmt: skip
     _variable(
-        file, "brdf_table_coverage", dimensions, table.coverage, long_name="origin of the value",
+        file, "brdf_table_coverage", dimensions, coverage, long_name="origin of the value",
         flag_values=np.array(list(COVERAGE), dtype=np.uint8), flag_meanings=" ".join(COVERAGE.values()),
     )  # fmt: skip
 
@@ -284,7 +332,7 @@ def _needed(path: Path, file: Contents, name: str, kind: str) -> None:
 def _array(path: Path, file: Contents, name: str, kind: str = "f") -> np.ndarray:
     _needed(path, file, name, name)
     data = file.arrays.get(name)
-    if data is None or data.dtype.kind not in kind or data.ndim > 4:
+    if data is None or data.dtype.kind not in kind or data.ndim > 5:
         shown = "texts" if data is None else f"{data.ndim} dimensions of {data.dtype}"
         raise DatasetError(f"{path}: {name} has {shown}, which gonio does not write; the file is damaged")
     return data.astype(float) if kind == "f" else data

@@ -129,7 +129,8 @@ def write(path: Path, material: Material, attributes: Mapping[str, str] | None =
 
 def read(path: Path) -> ChannelSamples:
     """Samples at the nodes of the value table; `DatasetError` if a field is missing, misshapen or not finite."""
-    fields, channels, value = _fields(path)
+    with np.errstate(invalid="ignore", over="ignore"):  # of numbers that are then refused
+        fields, channels, value = _fields(path)
     theta_i, phi_i = (np.asarray(fields[name], dtype=float) for name in ("theta_i", "phi_i"))
     isotropic = len(phi_i) <= 2
     vndf = np.asarray(fields["vndf"], dtype=float)

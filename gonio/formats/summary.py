@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import files, formats
-from gonio.brdf.tabulated import TabulatedBRDF, tabulate
+from gonio.brdf.base import BRDF
+from gonio.brdf.tables import Tables
+from gonio.brdf.tabulated import tabulate
 from gonio.channels import ChannelSamples
 from gonio.errors import DatasetError, IntegrationError
 from gonio.formats import quantity as quantities
-from gonio.integrate import directional_albedo
+from gonio.integrate import directional_albedo, reflectance_map
 from gonio.samples import BRDFSamples
+from gonio.source import uniform
 
 Array = NDArray[np.float64]
 ALBEDO_DEG = (0.0, 30.0, 60.0)
@@ -38,8 +41,14 @@ def describe(path: Path, quantity: str | None = None) -> dict[str, Any]:
     stated = quantity or form.quantity
     out["quantity_in_file"] = quantities.QUANTITIES[stated] if stated else "as the file says: see source_quantity"
     out["quantity_read"] = quantities.QUANTITIES["brdf"]
-    if isinstance(found, TabulatedBRDF):
-        out |= {"table_nodes": list(found.shape), "coverage": found.counts(), "attributes": dict(found.attributes)}
+    if isinstance(found, Tables):
+        out |= {
+            "table_nodes": list(found.main.shape),
+            "grain": found.grained,
+            "channels": list(found.channels.names),
+            "coverage": found.counts(),
+            "attributes": dict(found.attributes),
+        }
         return out | energy_of(found)
     channels = ChannelSamples.of(found) if isinstance(found, BRDFSamples) else found
     one = found if isinstance(found, BRDFSamples) else found.channel()
@@ -97,19 +106,26 @@ def reciprocity_of(samples: BRDFSamples) -> dict[str, Any]:
     return out
 
 
-def energy_of(data: BRDFSamples | TabulatedBRDF) -> dict[str, Any]:
+def energy_of(data: BRDFSamples | Tables) -> dict[str, Any]:
     """Directional albedo of the table, or of a table made from the samples; says why where there is none."""
     try:
-        if isinstance(data, TabulatedBRDF):
-            table = data
+        if isinstance(data, Tables):
+            brdf = data.brdf()
         else:
             take = np.random.default_rng(0).permutation(len(data))[:MOST]
-            table = tabulate(data.select(np.sort(take)), shape=(24, 16, 8))
-        brdf = table.brdf()
-        albedo = [float(directional_albedo(brdf, np.radians(a), rtol=1e-3).value) for a in ALBEDO_DEG]
+            brdf = tabulate(data.select(np.sort(take)), shape=(24, 16, 8)).brdf()
+        albedo = [_albedo(brdf, float(np.radians(a))) for a in ALBEDO_DEG]
     except (DatasetError, IntegrationError) as error:
         return {"energy": f"not known: {error}"}
     out: dict[str, Any] = {"albedo_deg": list(ALBEDO_DEG), "albedo": albedo}
     worst = max(albedo)
     out["energy"] = "conserved" if worst <= 1.0 else f"NOT conserved: an albedo of {worst:.4g} is above 1"
     return out
+
+
+def _albedo(brdf: BRDF, theta: float) -> float:
+    """Directional albedo; with a grain the mean over eight azimuths."""
+    if all(term.model.isotropic for term in brdf.terms):
+        return float(directional_albedo(brdf, theta, rtol=1e-3).value)
+    turned = np.pi * np.arange(8) / 8
+    return float(np.mean(reflectance_map(brdf, uniform(1.0), np.tan(theta), 0.0, rtol=1e-3, tangent=turned).value))

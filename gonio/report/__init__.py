@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from gonio.brdf.base import BRDF
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Tables
     from gonio.maps import ReflectanceMap
     from gonio.posterior import Posterior
     from gonio.samples import BRDFSamples
@@ -52,7 +52,7 @@ def build(
     *,
     title: str = "BRDF report",
     samples: BRDFSamples | None = None,
-    table: TabulatedBRDF | None = None,
+    table: Tables | None = None,
     posterior: Posterior | None = None,
     maps: Mapping[str, ReflectanceMap] | None = None,
     truth: Mapping[str, float] | None = None,
@@ -69,7 +69,7 @@ def build(
         Gets ``report.html``, ``report.json`` and ``figures/``; made if it does not exist.
     title : str, optional
     samples : BRDFSamples, optional
-    table : TabulatedBRDF, optional
+    table : Tables, optional
         Its line in the slices, and how much of it was measured.
     posterior : Posterior, optional
     maps : mapping of str to ReflectanceMap, optional

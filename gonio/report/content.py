@@ -23,7 +23,7 @@ from gonio.report.residuals import expected_reading, is_sound, verdict
 from gonio.samples import BRDFSamples
 
 if TYPE_CHECKING:
-    from gonio.brdf.tabulated import TabulatedBRDF
+    from gonio.brdf.tables import Tables
     from gonio.maps import ReflectanceMap
     from gonio.posterior import Posterior
 
@@ -196,7 +196,7 @@ def of_maps(maps: Mapping[str, ReflectanceMap]) -> Table:
     return Table("Reflectance maps R(p, q)", header, rows, "R and its integration error in W m^-2 sr^-1.")
 
 
-def of_table(table: TabulatedBRDF) -> Table:
+def of_table(table: Tables) -> Table:
     """Number of nodes of a tabulated BRDF by what they rest on."""
     counts = table.counts()
     above = sum(number for name, number in counts.items() if name != "below_horizon")
@@ -204,9 +204,11 @@ def of_table(table: TabulatedBRDF) -> Table:
         [name, number, 100.0 * number / above if above and name != "below_horizon" else None]
         for name, number in counts.items()
     ]
-    shape = " x ".join(str(n) for n in table.shape)
+    shape = " x ".join(str(n) for n in table.main.shape)
+    over = "phi_h, theta_h, theta_d, phi_d" if table.grained else "theta_h, theta_d, phi_d"
+    of = f", {len(table.channels)} channels" if len(table.channels) > 1 else ""
     return Table(
-        f"Tabulated BRDF, {shape} nodes over theta_h, theta_d, phi_d",
+        f"Tabulated BRDF, {shape} nodes over {over}{of}",
         ["coverage", "nodes", "of those above the horizon [%]"],
         rows,
         "Extrapolated nodes and those from a model are not measurements.",

@@ -251,6 +251,11 @@ class Run:
     # -- derived files
 
     @property
+    def channels_path(self) -> Path:
+        """The samples in all channels, of a run that was imported from a file with several."""
+        return self.path / "channels.nc"
+
+    @property
     def table_path(self) -> Path:
         """The tabulated BRDF."""
         return self.path / "table.nc"

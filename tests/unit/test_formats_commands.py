@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from gonio import formats
+from gonio.brdf.tables import Tables
 from gonio.cli.main import main
-from gonio.formats import opticstudio
+from gonio.formats import netcdf, opticstudio
+from gonio.geometry import unit_vector
 from gonio.scan import Run
 from tests import materials
 
@@ -107,6 +109,52 @@ def test_export_of_a_run_needs_a_table_or_a_fit(run: Path, tmp_path: Path, capsy
     capsys.readouterr()
     assert answer(capsys, "export", run, "--format", "bird", "--out", tmp_path / "a.json")["quantity"] == "brdf"
     assert formats.sniff(tmp_path / "a.json") == "bird"
+
+
+def test_table_of_all_channels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From someone's spectral file to tables of every wavelength, and on to formats that hold them."""
+    material, run = materials.spectrum(0.4), tmp_path / "run"
+    rows = material.rows()
+    formats.export("astm", tmp_path / "a.astm", samples=rows)
+    answer(capsys, "import", tmp_path / "a.astm", "--out", run)
+    found = answer(capsys, "table", run)
+    assert found["channels"] == ["450nm", "520nm", "580.5nm", "640nm"] and found["grain"] is False
+    tables = Tables.load(run / "table.nc")
+    wi, wr = (
+        unit_vector(np.radians(a), np.radians(b)) for a, b in (([20.0, 45.0], [0.0, 10.0]), ([25.0, 30.0], [180.0, 200.0]))
+    )
+    for table, brdf in zip(tables.tables, material.brdfs, strict=True):
+        np.testing.assert_allclose(table.brdf().evaluate(wi, wr), brdf.evaluate(wi, wr), rtol=0.02)
+    answer(capsys, "export", run, "--format", "bird", "--out", tmp_path / "a.json")
+    np.testing.assert_allclose(np.sort(formats.read_channels(tmp_path / "a.json").f_r, axis=0), np.sort(rows.f_r, axis=0))
+    answer(capsys, "export", run, "--format", "rgl", "--out", tmp_path / "a.bsdf")
+    assert formats.read_channels(tmp_path / "a.bsdf").channels == material.channels
+    answer(capsys, "export", run, "--format", "netcdf", "--out", tmp_path / "a.nc")
+    assert netcdf.contents(tmp_path / "a.nc") == {"samples", "table"}
+    # one channel on request; a fit, which knows one, fills no more
+    assert answer(capsys, "table", run, "--channel", "640nm")["channels"] == ["value"]
+    assert main(["table", str(run), "--channel", "700nm"]) == 2
+    assert "choose one of: 450nm, 520nm, 580.5nm, 640nm" in capsys.readouterr().err
+
+
+def test_table_keeps_a_grain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    material, run = materials.turned(0.3, 0.3, 0.8), tmp_path / "run"
+    rows = material.rows()
+    formats.export("csv", tmp_path / "a.csv", samples=rows.select(np.arange(0, len(rows), 24)))
+    answer(capsys, "import", tmp_path / "a.csv", "--out", run)
+    assert answer(capsys, "table", run)["grain"] is True
+    low = np.maximum(rows.theta_i, rows.theta_r) < 1.1
+    some = rows.select(np.flatnonzero(low)[::7])
+    found = Tables.load(run / "table.nc").brdf().f_r(some.theta_i, some.phi_i, some.theta_r, some.phi_r)
+    assert np.median(np.abs(found / some.f_r[:, 0] - 1)) < 0.05
+    found = answer(capsys, "info", run / "table.nc")
+    assert found["table_nodes"] == [24, 16, 12, 12]
+    # by a Monte Carlo of the albedo at normal incidence: E[f_r pi] over directions weighted with the cosine
+    u, phi = np.random.default_rng(1).random((2, 200_000))
+    one = material.evaluate(
+        np.broadcast_to([0.0, 0.0, 1.0], (len(u), 3)), unit_vector(np.arcsin(np.sqrt(u)), 2 * np.pi * phi)
+    )
+    assert found["albedo"][0] == pytest.approx(np.pi * one.mean(), rel=0.05)  # type: ignore[index]
 
 
 def test_bundle_is_whole_and_its_sums_are_right(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,10 +11,14 @@ import xarray
 
 import gonio
 from gonio import formats
+from gonio.brdf import grained
+from gonio.brdf.tables import Tables
 from gonio.brdf.tabulated import TabulatedBRDF, from_brdf
+from gonio.channels import spectral
 from gonio.errors import DatasetError
 from gonio.formats import netcdf
 from gonio.samples import BRDFSamples, SharedError
+from tests import materials
 
 ARRAYS = ("theta_i", "phi_i", "theta_r", "phi_r", "f_r", "u_f_r", "pose", "d_omega_i", "d_omega_r", "d_ln_f")
 
@@ -55,8 +59,41 @@ def test_table_comes_back_bit_for_bit(tmp_path: Path, table: TabulatedBRDF) -> N
     for name in ("value", "u", "coverage"):
         np.testing.assert_array_equal(getattr(after, name), getattr(table, name))
     assert dict(after.attributes) == dict(table.attributes)
-    assert isinstance(formats.read(tmp_path / "table.nc"), TabulatedBRDF)
+    assert isinstance(formats.read(tmp_path / "table.nc"), Tables)
     assert netcdf.contents(tmp_path / "table.nc") == {"table"}
+
+
+@pytest.mark.parametrize("grain", [False, True])
+def test_tables_of_channels_come_back_bit_for_bit(tmp_path: Path, grain: bool) -> None:
+    """Of a spectrum, with and without a grain; xarray sees the same numbers on named axes."""
+    spectrum = spectral([450.0, 555.5])
+    brdfs = [
+        gonio.brdf.make("lambertian", albedo=a) + gonio.brdf.make("ggx", k_s=1.0, alpha=0.3, f_0=0.04) for a in (0.2, 0.6)
+    ]
+    make = grained.from_brdf if grain else from_brdf
+    shape = (6, 8, 7, 5) if grain else (8, 7, 5)
+    before = Tables(tuple(make(brdf, shape) for brdf in brdfs), spectrum)  # type: ignore[operator]
+    before.save(tmp_path / "a.nc")
+    after = Tables.load(tmp_path / "a.nc")
+    assert after.channels == spectrum and after.grained == grain and dict(after.attributes) == dict(before.attributes)
+    for old, new in zip(before.tables, after.tables, strict=True):
+        assert type(old) is type(new) and old.scale == new.scale
+        for name in ("value", "u", "coverage"):
+            np.testing.assert_array_equal(getattr(new, name), getattr(old, name))
+    axes = ("phi_h",) * grain + ("theta_h", "theta_d", "phi_d")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
+        assert data["brdf_table"].dims == ("channel", *axes)
+        np.testing.assert_array_equal(data["brdf_table"].values[1], before.tables[1].value)
+        np.testing.assert_array_equal(data["wavelength"].values, [450.0, 555.5])
+        for axis, nodes in zip(axes, before.main.nodes(), strict=True):
+            np.testing.assert_array_equal(data[axis].values, nodes)
+    with pytest.raises(DatasetError, match="grain or several channels"):
+        TabulatedBRDF.load(tmp_path / "a.nc")
+    # samples of the same channels may stand beside them, of others not
+    rows = materials.rgb().rows()
+    with pytest.raises(DatasetError, match="different channels"):
+        formats.export("netcdf", tmp_path / "b.nc", samples=rows, table=before)
+    assert not (tmp_path / "b.nc").exists()
 
 
 def test_both_in_one_file(tmp_path: Path, table: TabulatedBRDF) -> None:
@@ -161,7 +198,7 @@ def test_files_that_cannot_be_trusted(tmp_path: Path, table: TabulatedBRDF) -> N
         fresh()
         change(path, edit)
         with pytest.raises(DatasetError, match=message):
-            _ = netcdf.read_samples(path) if kind == "samples" else netcdf.read_table(path)
+            _ = netcdf.read_samples(path) if kind == "samples" else netcdf.read_tables(path)
 
 
 def test_what_is_not_there(tmp_path: Path, table: TabulatedBRDF) -> None:

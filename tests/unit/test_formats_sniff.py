@@ -17,7 +17,7 @@ from gonio.formats import cornell, csv, hdf5, merl, netcdf, opticstudio
 from gonio.samples import BRDFSamples
 
 REAL = Path(__file__).parents[1] / "data" / "optics-blacks" / "AnoBlackEC1onAlum.bsdf"
-READERS = (csv.read, opticstudio.read, cornell.read, merl.read, netcdf.read_samples, netcdf.read_table, formats.read)
+READERS = (csv.read, opticstudio.read, cornell.read, merl.read, netcdf.read_samples, netcdf.read_tables, formats.read)
 CSV = b"theta_i_deg,phi_i_deg,theta_r_deg,phi_r_deg,f_r,u_f_r\n30,0,45,180,0.25,\n"
 CORNELL = b"# paint\n1\n550\n0.5 0 0.7 3.14159 0.1\n0.6 0 0.7 3.14159 0.2\n"
 SEEDS = (CSV, CORNELL, REAL.read_bytes()[1200:], merl.HEADER + bytes(64), hdf5.SIGNATURE[:7] + bytes(200))

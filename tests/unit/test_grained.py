@@ -67,6 +67,16 @@ def test_scattered_samples_with_a_grain(truth: gonio.BRDF) -> None:
     assert counts["measured"] > 500 and counts["extrapolated"] > 0 and counts["below_horizon"] > 0
 
 
+def test_a_grain_is_seen_in_scattered_samples_and_only_there(truth: gonio.BRDF) -> None:
+    """No two directions are measured at two azimuths, so only what predicts the others can tell."""
+    at, rng = pairs(800, 7), np.random.default_rng(8)
+    for brdf, there in ((truth, True), (materials.paint(0.3, 0.3), False)):
+        f = brdf.f_r(*at)
+        assert grained.shown_by(BRDFSamples.plain(*at, f * (1 + 0.02 * rng.standard_normal(len(f))), 0.02 * f)) is there
+    one = BRDFSamples.plain(at[0], 0.0, at[2], at[3], truth.f_r(at[0], 0.0, at[2], at[3]))
+    assert not grained.shown_by(one)
+
+
 def test_map_of_a_table_with_a_grain_needs_its_tangent(truth: gonio.BRDF) -> None:
     table = grained.from_brdf(truth, (24, 16, 8, 8)).brdf()
     lamp = gonio.source.collimated(0.5, 0.3)
