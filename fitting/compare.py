@@ -11,9 +11,10 @@ Differences have a standard error from their scatter over readings, over groups 
 are a decision. Every model has a relative discrepancy of its own or, where the samples state no uncertainty, a noise of its
 own, so that a wrong model is not merely punished for too narrow a variance.
 
-A best model need not be a good one. `Score.adequate` asks for chi^2/N within its limits, with the uncertainties as stated,
-and for residuals of neighbouring directions that are not alike: their correlation is the share of the misfit that is the
-model's and not noise. Where no uncertainty is stated, this is all there is to judge by.
+A best model need not be a good one. `Comparison.faults` asks for chi^2/N within its limits, with the uncertainties as
+stated, and for residuals of neighbouring directions that are not alike: their correlation is the share of the misfit that
+is the model's and not noise. Where no uncertainty is stated, the noise that a model needs must also not be much more than
+what a better one needs for the same readings.
 
 References
 ----------
@@ -27,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,8 @@ from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
 FOLDS = 10
-DECISIVE = 4.0  # standard errors
+DECISIVE, LIKELY = 4.0, 2.0  # standard errors
+MORE_NOISE = 1.5
 ALIKE = 0.3  # correlation of neighbouring residuals above which the misfit is the model's
 _DRAWS = 2048  # of a fit
 _RULE = Rule(ensembles=2, taus=20.0, drift=0.1)
@@ -92,22 +94,6 @@ class Score:
     blind: tuple[str, ...]
     sampled: int
 
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """Why the model is not adequate; empty if it is."""
-        n = len(self.loo)
-        found = []
-        if self.chi2_per_n > misfit_limit(n):
-            found.append(f"chi2/N = {self.chi2_per_n:.3g}")
-        if self.alike > max(ALIKE, 4.0 / math.sqrt(n)):
-            found.append(f"{100 * self.alike:.0f} % of the misfit is systematic")
-        return tuple(found)
-
-    @property
-    def adequate(self) -> bool:
-        """Whether the residuals look like noise of the stated size."""
-        return not self.faults
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -138,33 +124,55 @@ class Comparison:
         total = float(np.sum(parts))
         return total, float(np.std(parts, ddof=min(1, len(parts) - 1)) * math.sqrt(len(parts)))
 
+    def faults(self, score: Score) -> tuple[str, ...]:
+        """Why a model is not adequate; empty if its residuals look like noise of the size that there is."""
+        n, best = len(score.loo), self.scores[0]
+        found = []
+        if score.chi2_per_n > misfit_limit(n):
+            found.append(f"chi2/N = {score.chi2_per_n:.3g}")
+        if score.alike > max(ALIKE, 4.0 / math.sqrt(n)):
+            found.append(f"{100 * score.alike:.0f} % of the misfit is systematic")
+        gap, error = self.difference(score, self.kind)
+        if math.isnan(score.chi2_per_n) and score.noise > MORE_NOISE * best.noise and gap > LIKELY * error:
+            found.append(f"off by {100 * score.noise:.2g} % where {best.model} is by {100 * best.noise:.2g} %")
+        return tuple(found)
+
+    @property
+    def kind(self) -> str:
+        """The score that ranks: ``"incidence"``, or ``"loo"`` where there is one incidence."""
+        return "incidence" if len(self.theta_i) > 1 else "loo"
+
     def verdict(self) -> list[str]:
         """What to conclude, in sentences."""
         best = self.scores[0]
         said = []
         if len(self.scores) > 1:
-            kind = "incidence" if len(self.theta_i) > 1 else "loo"
-            gap, error = self.difference(self.scores[1], kind)
-            told = "beyond doubt" if gap > DECISIVE * error else "not by much"
-            name = "left-out incidences" if kind == "incidence" else "left-out readings"
+            gap, error = self.difference(self.scores[1], self.kind)
+            sure = "beyond doubt" if gap > DECISIVE * error else "probably" if gap > LIKELY * error else "but not surely"
+            name = "left-out incidences" if self.kind == "incidence" else "left-out readings"
             said.append(
-                f"{best.model} predicts {name} best, {told}: {self.scores[1].model} is {gap:.0f} +- {error:.0f} behind"
+                f"{best.model} predicts {name} best, {sure}: {self.scores[1].model} is {gap:.0f} +- {error:.0f} behind"
             )
             nearest = max(self.scores, key=lambda s: float(np.sum(s.loo)))
-            if nearest is not best:
-                gap, error = self.difference(best, "loo", nearest)
+            gap, error = self.difference(best, "loo", nearest)
+            if gap > LIKELY * error:
                 said.append(
                     f"between neighbouring directions {nearest.model} is better, by {gap:.0f} +- {error:.0f}: it describes "
                     "what was measured and extrapolates worse"
                 )
-        good = [s for s in self.scores if s.adequate]
+        good = [s for s in self.scores if not self.faults(s)]
         if good:
-            said.append("adequate: " + ", ".join(s.model for s in good))
-        else:
+            said.append(f"adequate: {', '.join(s.model for s in good)}")
+        bad = "; ".join(f"{s.model}: {', '.join(self.faults(s))}" for s in self.scores if s not in good)
+        if bad:
             said.append(
-                "no model is adequate: " + "; ".join(f"{s.model}: {', '.join(s.faults)}" for s in self.scores)
-                + "; use the table, or another model"
-            )  # fmt: skip
+                f"{'not' if good else 'no model is'} adequate: {bad}{'' if good else '; use the table, or another model'}"
+            )
+        if math.isnan(best.chi2_per_n):
+            said.append(
+                "the samples state no uncertainty: adequate means that the residuals look like noise, not that noise of "
+                "that size is likely"
+            )
         for s in self.scores:
             if s.blind:
                 said.append(f"{s.model}: the samples do not inform {', '.join(s.blind)}; its prior decides")
@@ -226,10 +234,9 @@ def compare(
         scores.append(_score(samples, model, group, shared, seed, own))
         if progress is not None:
             progress(done, len(models))
-    kind = "incidence" if group.max() > 0 else "loo"
-    scores.sort(key=lambda s: -float(np.sum(getattr(s, kind))))
-    count = np.bincount(group)
-    return Comparison(tuple(scores), group, np.bincount(group, samples.theta_i) / count)
+    theta_i = np.bincount(group, samples.theta_i) / np.bincount(group)
+    found = Comparison(tuple(scores), group, theta_i)
+    return replace(found, scores=tuple(sorted(scores, key=lambda s: -float(np.sum(getattr(s, found.kind))))))
 
 
 def incidences(theta_i: Array) -> NDArray[np.int64]:

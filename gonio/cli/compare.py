@@ -103,7 +103,7 @@ def show(output: Output, found: Comparison, angles: set[str]) -> None:
                 "model": s.model, "parameters": {k: {"mean": m, "sd": sd} for k, (m, sd) in s.parameters.items()},
                 "loo": found.difference(s, "loo"), "incidence": found.difference(s, "incidence") if several else None,
                 "effective_parameters": s.effective_parameters, "chi2_per_n": s.chi2_per_n, "noise": s.noise,
-                "systematic": s.alike, "adequate": s.adequate, "not_informed": s.blind,
+                "systematic": s.alike, "adequate": not found.faults(s), "not_informed": s.blind,
             }
             for s in found.scores
         ],

@@ -12,7 +12,7 @@ from scipy import stats
 
 import gonio
 from fitting import fit
-from fitting.compare import Score, compare, incidences
+from fitting.compare import compare, incidences
 from gonio.cli.compare import split
 from gonio.cli.main import main
 from gonio.errors import ParameterError
@@ -32,11 +32,12 @@ def test_the_model_that_made_the_data_wins_and_the_other_one_is_inadequate(right
     assert gap > 10 * error > 0
     gap, error = found.difference(other, "incidence")
     assert gap > 4 * error
-    assert best.adequate and not other.adequate
+    assert not found.faults(best) and found.faults(other)
     assert best.chi2_per_n == pytest.approx(1.0, abs=4 * math.sqrt(2 / 200)) and other.chi2_per_n > 3
     assert best.noise < 0.005 < other.noise
     told = found.verdict()
     assert "beyond doubt" in told[0] and told[1] == f"adequate: lambertian+{right}"
+    assert told[2].startswith(f"not adequate: lambertian+{wrong}: chi2/N = ")
 
 
 def test_loo_of_paper_is_that_of_the_exact_leave_one_out_fits():
@@ -68,10 +69,14 @@ def test_residuals_that_follow_their_neighbours_are_no_noise():
     held = {"noise.absolute": 1e-3}
     found = compare(BRDFSamples.plain(0.5, 0.0, theta, 2.0, y), ["lambertian"], fix=held)
     assert found.scores[0].alike > 0.95
-    assert found.verdict()[-1].startswith("no model is adequate: lambertian: ")
+    assert found.verdict()[0].startswith("no model is adequate: lambertian: ")
+    assert "state no uncertainty" in found.verdict()[1]
     assert math.isnan(found.scores[0].chi2_per_n)
     noisy = 0.5 / math.pi * (1.0 + 0.05 * np.random.default_rng(2).normal(size=200))
-    assert compare(BRDFSamples.plain(0.5, 0.0, theta, 2.0, noisy), ["lambertian"], fix=held).scores[0].adequate
+    assert (
+        compare(BRDFSamples.plain(0.5, 0.0, theta, 2.0, noisy), ["lambertian"], fix=held).verdict()[0]
+        == "adequate: lambertian"
+    )
 
 
 def glass(top, seed):
@@ -122,8 +127,15 @@ def test_the_command_on_a_measured_black(capsys):
     assert any(said.startswith("no model is adequate") for said in found["verdict"])
 
 
-def test_faults_name_what_is_wrong():
-    plain = {"model": "m", "parameters": {}, "loo": np.zeros(100), "incidence": np.zeros(100), "effective_parameters": 1.0,
-             "unsure": 0.0, "noise": 0.0, "blind": (), "sampled": 0}  # fmt: skip
-    assert Score(**plain, chi2_per_n=2.0, alike=0.5).faults == ("chi2/N = 2", "50 % of the misfit is systematic")
-    assert Score(**plain, chi2_per_n=1.1, alike=0.1).adequate
+def test_a_model_that_needs_more_noise_than_a_better_one_is_not_adequate():
+    """Lambert's law on a rough wall of Oren and Nayar, 2 % noise that nobody stated."""
+    rng = np.random.default_rng(5)
+    theta_i, theta_r, phi_r = rng.uniform(0, 1.2, 80), rng.uniform(0, 1.2, 80), rng.uniform(0, 6.2, 80)
+    f = gonio.brdf.make("oren_nayar", albedo=0.6, sigma=0.5).f_r(theta_i, 0.0, theta_r, phi_r)
+    samples = BRDFSamples.plain(theta_i, 0.0, theta_r, phi_r, f * (1.0 + 0.02 * rng.normal(size=80)))
+    found = compare(samples, ["lambertian", "oren_nayar"], fix={"noise.absolute": 1e-3})
+    assert [s.model for s in found.scores] == ["oren_nayar", "lambertian"]
+    assert not found.faults(found.scores[0])
+    assert found.scores[0].noise == pytest.approx(0.02, abs=0.006)
+    assert found.scores[1].noise > 0.05
+    assert any("where oren_nayar is by" in said for said in found.faults(found.scores[1])), found.faults(found.scores[1])
