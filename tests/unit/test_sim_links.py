@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import socket
 import sys
@@ -209,6 +210,34 @@ def test_bytes_are_paced_at_the_lines_speed() -> None:
         # 240 bits at 57.6 kbit/s and the return delay; the connection heard it no later than now
         wait = 1e5 * (240 / 57_600 + 500e-6)
         assert first - wait <= sent <= first
+    link.close()
+
+
+SYNC_READ = encode(0xFE, Instruction.SYNC_READ, b"\x84\x00\x04\x00\x01\x02\x03")
+_ANSWER_S = 500e-6 + 15 * 10 / 57_600  # return delay and 15 bytes, each answer after the one before it
+
+
+def test_the_answers_of_a_sync_read_follow_each_other_on_the_wire(clock: VirtualClock) -> None:
+    bus = DynamixelBus([Servo(k, baud_code=1) for k in (1, 2, 3)])
+    with serial.serial_for_url(attach("bus", bus, clock), baudrate=57_600, timeout=0.5) as port:
+        port.write(SYNC_READ)
+        for k in (1, 2, 3):
+            assert len(port.read(15)) == 15
+            assert clock.now() == pytest.approx(17 * 10 / 57_600 + k * _ANSWER_S, abs=1e-8)
+    detach("bus")
+
+
+def test_a_paced_link_has_them_due_at_the_same_times() -> None:
+    slow = 1e5  # wall seconds in a rig second
+    link = TcpLink(DynamixelBus([Servo(k) for k in (1, 2, 3)]), ScaledClock(1.0 / slow), baud=57_600)
+    with socket.create_connection(link.address) as client:
+        (connection,) = (one for _ in range(100) for one in link.on_readable())
+        client.sendall(encode(0xFE, Instruction.SYNC_WRITE, b"\x74\x00\x04\x00\x01\x00\x08\x00\x00") + SYNC_READ)
+        while connection.due() is None:
+            connection.on_readable()
+        dues = [due for due, _ in connection._queue]  # type: ignore[attr-defined]
+        assert dues[0] - time.monotonic() <= slow * ((19 + 17) * 10 / 57_600 + _ANSWER_S)
+        assert [b - a for a, b in itertools.pairwise(dues)] == pytest.approx([slow * _ANSWER_S] * 2, rel=1e-9)
     link.close()
 
 
