@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 _FEW = 64  # gradients up to which a table in theta_n does not pay
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
 _CELLS = 1 << 20  # with which gradients may be done that rings leave above their tolerance: seconds
+_FEW_CELLS, _FEW_WAVES = 1 << 10, 256  # so many cells cost a gradient less than twice as many waves
 _AT_LEAST, _PER_LOBE = 100, 20  # cells that one gradient takes
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
 _SAMPLE_OF_TREE = 0.015
@@ -178,8 +179,10 @@ class Run:
             return worst
         some, v, e = grid.select(missed), np.zeros(missed.size), np.zeros(missed.size)
         table.add(some, (0, missed.size), rtol, math.inf, v, e)
-        if missed.size <= most:
-            v, e = self._better(step, field, some.elements(), v, e, self._spare(value[missed], error[missed]), threads)
+        late = np.arange(missed.size) if missed.size <= most else np.flatnonzero(e > negligible)
+        if late.size <= most:
+            spare = self._spare(value[missed[late]], error[missed[late]])
+            v[late], e[late] = self._better(step, field, some.elements().select(late), v[late], e[late], spare, threads)
         value[missed] += v
         error[missed] += e
         return max(worst, _largest(error[missed], value[missed], negligible))
@@ -189,7 +192,8 @@ class Run:
     ) -> tuple[Array, Array]:
         """Rings slope by slope; up to `most` that they leave above their tolerance by cells."""
         scene = scene_of(step.term, field, self.rtol, step.effort, threads)
-        v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare)
+        waves = _FEW_WAVES if len(elements) <= most and _cells_of(field) <= _FEW_CELLS else 1 << 20
+        v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare, most_waves=waves)
         missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
         if 0 < missed.size <= most:
             v[missed], e[missed] = self._better(

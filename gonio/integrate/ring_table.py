@@ -28,6 +28,7 @@ _WAVES_IN_PIECE = 8.0  # length of a piece times waves
 _NOISE = 0.1  # of the tolerance, for the quadrature
 _DOUBT = 0.03  # of the digits asked for, which sums may miss alike
 _SOME = [1, 2]  # probes of which the noise is measured
+_FLOORS = 2.5  # of the error that no digits lower: what may be asked for
 _PATCHING = 0.05  # of the tolerance, for reading between the nodes
 
 
@@ -148,7 +149,7 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
         doubt = _DOUBT * 10.0**-digits * float(np.abs(exact).max())
         error = _SAFETY * missed + doubt + floor + cut + tail
         smallest = min(float(np.abs(exact).min()), float(np.abs(on_azimuths(nodal, columns)).min()))
-        allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), 5.0 * floor, resolution)
+        allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), _FLOORS * floor, resolution)
         noise = max(noise, cut, 0.3 * doubt)
         noisy = noise > _NOISE * allowed and digits < MOST_DIGITS
         trials.append(

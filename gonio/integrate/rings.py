@@ -55,7 +55,9 @@ def slopes_are_few(gradients: Gradients) -> bool:
     return len(np.unique(start.cos_theta)) <= FEW and len(np.unique(gradients.elements().cos_theta)) <= FEW
 
 
-def integrate_rings(scene: Scene, elements: Elements, *, rtol: float, atol: float | Array) -> tuple[Array, Array]:
+def integrate_rings(
+    scene: Scene, elements: Elements, *, rtol: float, atol: float | Array, most_waves: int = 1 << 20
+) -> tuple[Array, Array]:
     """Reflected radiance of each element, slope by slope.
 
     Parameters
@@ -66,6 +68,8 @@ def integrate_rings(scene: Scene, elements: Elements, *, rtol: float, atol: floa
     rtol : float
     atol : float or ndarray, shape (n,)
         Tolerance per element. An element that does not reach it keeps its honest error.
+    most_waves : int, optional
+        Up to which the sums may go, where something else is faster then.
 
     Returns
     -------
@@ -75,7 +79,8 @@ def integrate_rings(scene: Scene, elements: Elements, *, rtol: float, atol: floa
     tau = elements.sin_theta / (1.0 + elements.cos_theta)
     phi = np.arctan2(elements.sin_phi, elements.cos_phi)
     slopes, where = np.unique(tau, return_inverse=True)
-    value, error = _directly(scene, slopes, where, phi, rtol, np.broadcast_to(np.asarray(atol, dtype=float), tau.shape))
+    absolute = np.broadcast_to(np.asarray(atol, dtype=float), tau.shape)
+    value, error = _directly(scene, slopes, where, phi, rtol, absolute, min(scene.rings.waves, most_waves))
     return np.maximum(value, scene.least), np.maximum(error, scene.least - value)
 
 
@@ -89,12 +94,12 @@ def _series(sums: Array, phi: Array) -> Array:
 
 
 def _directly(
-    scene: Scene, slopes: Array, where: NDArray[np.intp], phi: Array, rtol: float, atol: Array
+    scene: Scene, slopes: Array, where: NDArray[np.intp], phi: Array, rtol: float, atol: Array, most: int
 ) -> tuple[Array, Array]:
     """Each slope by itself, with more digits and more waves until the tolerance is met."""
     value, error = np.zeros(len(phi)), np.full(len(phi), np.inf)
     digits = first_digits(rtol)
-    waves = min(scene.rings.waves, scene.first_waves)
+    waves = min(most, scene.first_waves)
     pending = np.arange(len(slopes))
     rough, before = scene.sums(slopes, digits, waves), np.full(len(slopes), np.inf)
     while True:
@@ -108,13 +113,16 @@ def _directly(
         for j, k in enumerate(pending):
             here = np.flatnonzero(where == k)
             value[here] = _series(np.broadcast_to(fine[j], (len(here), *fine[j].shape)), phi[here])
-            error[here] = missed[j] + tail[j] + float(fine[j, 2, 2]) + floor_of(scene, fine[j])
-            again[j] = np.any(error[here] > np.maximum(rtol * np.abs(value[here]), atol[here]))
+            floor = floor_of(scene, fine[j])
+            error[here] = missed[j] + tail[j] + float(fine[j, 2, 2]) + floor
+            tolerance = np.maximum(rtol * np.abs(value[here]), atol[here])
+            lasting = floor + tail[j] if waves == most else floor  # no digits lower it
+            again[j] = np.any((error[here] > tolerance) & (lasting <= tolerance))
         if not np.any(again):
             return value, error
-        pending, few_waves = pending[again], np.any(tail[again] > 0.4 * missed[again]) and waves < scene.rings.waves
+        pending, few_waves = pending[again], np.any(tail[again] > 0.4 * missed[again]) and waves < most
         if few_waves:
-            waves = min(scene.rings.waves, 2 * waves)
+            waves = min(most, 2 * waves)
             rough, before = scene.sums(slopes[pending], digits, waves), np.full(len(pending), np.inf)
         elif digits < MOST_DIGITS - _STEP:
             digits, rough, before = digits + _STEP, fine[again], step[again]

@@ -235,7 +235,8 @@ def _of_samples(field: Field, tolerance: float) -> Spectrum:
         while True:
             values = field.at(_grid(theta, azimuths)).reshape(len(theta), azimuths)
             transform = np.fft.rfft(values, axis=1) / azimuths
-            scale = max(scale, float(np.max(np.abs(values))))
+            here = float(np.max(np.abs(values)))
+            scale = max(scale, here)
             tail = float(np.max(np.sum(np.abs(transform[:, -max(2, azimuths // 8) :]), axis=1)))
             if tail <= tolerance * scale or azimuths >= _LARGEST:
                 break
@@ -247,7 +248,7 @@ def _of_samples(field: Field, tolerance: float) -> Spectrum:
             middle = 0.5 * (a + b)
             pending[:0] = [(a, middle, depth + 1), (middle, b, depth + 1)]
             continue
-        done.append((b, matrix @ transform[: _DEGREE + 1], 2.0 * missed + 2.0 * tail))
+        done.append((b, matrix @ transform[: _DEGREE + 1], 2.0 * missed + 2.0 * tail + 8.0 * EPS * here))
     waves = max(waved.shape[1] for _, waved, _ in done)
     table = np.zeros((len(done), _DEGREE + 1, 2, waves))
     for k, (_, waved, _) in enumerate(done):
@@ -257,7 +258,7 @@ def _of_samples(field: Field, tolerance: float) -> Spectrum:
     negligible = 0.1 * tolerance * scale
     size = np.hypot(*np.moveaxis(np.abs(table).sum(axis=1), 1, 0))
     waves = max(3, int((np.cumsum(size[:, ::-1], axis=1)[:, ::-1] > negligible).sum(axis=1).max()))
-    error = np.array([e for *_, e in done]) + size[:, waves:].sum(axis=1) + 8.0 * EPS * scale
+    error = np.array([e for *_, e in done]) + size[:, waves:].sum(axis=1)
     table, size = np.ascontiguousarray(table[..., :waves]), np.ascontiguousarray(size[:, :waves])
     return Spectrum(np.array([0.0] + [b for b, *_ in done]), table, size, error, *_beyond(size, 0.0))
 
