@@ -33,7 +33,6 @@ FREEDOM = 5.0  # of Student's t
 _WIDE, _WIDE_SHARE = 3.0, 0.05
 _PILOT, _ROUNDS = 1000, 7
 _POOR = 0.25  # share of draws that count below which another proposal is fitted
-_LEAST = 5.0  # effective draws to fit one to
 _FITTED, _STEPS = 1000, 12  # draws and steps of a fit
 _EACH = 10.0  # effective draws for each coordinate of a component
 _MOST = 50  # proposals for each effective draw wanted
@@ -149,13 +148,16 @@ def run(target: Target, modes: Sequence[Mode], *, seed: int, effective: int = 40
         worth = float(psis.effective(smoothed)) if np.isfinite(log_weights).any() else 0.0
         if k_hat <= psis.GOOD and worth >= effective:
             return _collected(parts, smoothed, effective // batches, float(k_hat), worth, used, rng)
-        if worth < _LEAST:
+        if worth == 0.0:
             return None
         share = worth / (each * batches)
         if k_hat > psis.GOOD or share < _POOR:
-            u = np.concatenate([u for u, _, _ in parts])[_again(np.exp(smoothed), _FITTED, rng)]
+            u = np.concatenate([u for u, _, _ in parts])
             # a component needs draws that are not copies of a few
-            proposal = Mixture.fitted(u, max(1, min(len(modes) + number, int(worth / (_EACH * u.shape[1])))), rng)
+            levelled = _levelled(smoothed, _EACH * u.shape[1])
+            most = int(float(psis.effective(levelled)) / (_EACH * u.shape[1]))
+            u = u[_again(np.exp(levelled), _FITTED, rng)]
+            proposal = Mixture.fitted(u, max(1, min(len(modes) + number, most)), rng)
         # as many as are needed if the next proposal is as good as this one or one of `_POOR`
         n = min(math.ceil(1.2 * effective / max(share, _POOR)), 2 * n if k_hat > psis.GOOD else _MOST * effective)
     return None
@@ -178,6 +180,17 @@ def _propose(target: Target, proposal: Mixture, n: int, rng: np.random.Generator
     u = proposal.draw(n, rng)
     density, drawn = target.evaluate_and_draw(u, rng)
     return u, density - proposal.log_density(u) + drawn.log_weight, drawn
+
+
+def _levelled(log_weights: Array, least: float) -> Array:
+    """Normalised log weights, raised to a power below 1 if they are worth less than `least` draws: then just that many."""
+    power = 1.0
+    out = log_weights
+    while float(psis.effective(out)) < least and power > 1e-6:
+        power *= 0.8
+        out = power * log_weights
+        out = out - np.logaddexp.reduce(out)
+    return np.asarray(out)
 
 
 def _again(weight: Array, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -1,7 +1,7 @@
 r"""The modes of a posterior: many starts, least squares, Newton, and the Laplace approximation at each.
 
 The likelihood of a narrow lobe has local maxima: a lobe between the sampled directions fits nothing. So least squares
-starts from several widths, ln alpha = -4 to -1, each with the best of many prior draws of the other parameters. The linear
+starts from several widths, ln alpha = -4 to -0.3, each with the best of many prior draws of the other parameters. The linear
 coefficients are no unknowns of it: for any others they are solved for, within their ranges (variable projection [1]_). The
 exact posterior (variance of the model, priors, Jacobians) is then climbed from each solution by damped Newton steps with
 finite differences. All trial points of a step are evaluated in one call of the compiled likelihood.
@@ -28,7 +28,7 @@ from fitting.linear import coefficients, columns, products, solve_in_box
 from gonio.errors import ConvergenceError
 
 Array = NDArray[np.float64]
-LN_WIDTHS = (-4.0, -3.0, -2.0, -1.0)
+LN_WIDTHS = (-4.0, -3.0, -2.0, -1.0, -0.3)
 PRIOR_DRAWS = 256
 WIDEST = 1.5
 _EDGE = 6.0

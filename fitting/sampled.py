@@ -110,8 +110,10 @@ def _of_importance(target: Target, found: importance.Weighted) -> Sampled:
         f"converged: {found.effective:.0f} effective draws of {found.proposals} by importance sampling, "
         f"Pareto k = {max(found.k_hat, 0.0):.2f} (at most {psis.GOOD})"
     )
+    # drawing again in proportion to the weights adds the variance of that many draws
+    ess = 1.0 / (1.0 / found.effective + 1.0 / (found.draws.shape[0] * found.draws.shape[1]))
     return Sampled(
-        found.draws, found.log_posterior, True, status, np.full(d, found.effective), split_rhat(found.draws),
+        found.draws, found.log_posterior, True, status, np.full(d, ess), split_rhat(found.draws),
         found.effective / found.proposals, numbers,
     )  # fmt: skip
 

@@ -2,8 +2,8 @@
 
 Rationale: a rig's scale and axis zeros are off by one unknown amount in a whole measurement. Each set draws them, an encoder
 error in every pose, the noise and the material; its samples come from rotation matrices and formulas in NumPy, which share
-nothing with the likelihood. Expected: 68 % and 95 % of the intervals hold the truth, and far fewer if the same sets are fitted
-as if nothing was shared.
+nothing with the likelihood. Expected: 68 % and 95 % of the intervals hold the truth, and far fewer if the same sets are
+fitted as if nothing was shared.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ GRADIENTS = np.array([
 
 
 def reflectances(albedo, alpha, f_0):
-    """R(p, q) for an irradiance of 1 across the light [1/sr]: f_r cos theta_i at each of `GRADIENTS`; arguments broadcast."""
+    """R(p, q) for an irradiance of 1 across the light [1/sr]: f_r cos theta_i at each of `GRADIENTS`."""
     out = []
     for p, q in GRADIENTS:
         normal = np.array([-p, -q, 1.0]) / math.sqrt(1.0 + p * p + q * q)

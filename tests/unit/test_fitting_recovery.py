@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from fitting import Rule, fit
-from gonio.errors import ConvergenceError, ParameterError
+from gonio.errors import ParameterError
 from gonio.samples import BRDFSamples, SharedError
 from tests.measurements import measure
 
@@ -161,39 +161,12 @@ def test_more_samples_than_asked_for_are_cut_and_said():
     assert "a random 100 of 300 samples" in " ".join(posterior.diagnostics["advice"])
 
 
-@pytest.mark.parametrize(
-    "samples",
-    [
-        BRDFSamples.plain([0.3], [0.0], [0.5], [3.0], [0.2], [0.01]),
-        BRDFSamples.plain([0.3, 0.3], 0.0, [0.5, 0.6], 3.0, [0.0, 0.0]),
-        BRDFSamples.plain(np.full(9, 0.5), 0.0, np.linspace(0, 1.4, 9), 3.0, np.full(9, 0.3), 0.01),
-        BRDFSamples.plain(np.full(9, 0.5), 0.0, 0.5, 3.0, np.full(9, 0.3)),
-        BRDFSamples.plain(np.full(9, 0.5), 0.0, np.linspace(0, 1.4, 9), 3.0, np.full(9, -0.3), 0.01),
-    ],
-    ids=["one sample", "all zero, unknown noise", "one theta_i", "one geometry, no scatter", "negative"],
-)
-def test_degenerate_data_give_a_defined_result(samples):
-    posterior = fit(samples, seed=1, rule=Rule(ensembles=2, taus=5, first=100, max_steps=300))
-    assert np.all(np.isfinite(posterior.draws))
-    values = posterior.flat()[:, :3]
-    assert np.all((values >= 0) & (values <= 1))
-    assert posterior.brdf().f_r(0.3, 0.0, 0.3, math.pi) >= 0
-    assert posterior.diagnostics["advice"]
-
-
 def test_a_seed_or_a_length_that_makes_no_sense_is_refused():
     s = BRDFSamples.plain([0.3], [0.0], [0.5], [3.0], [0.2], [0.01])
     with pytest.raises(ParameterError, match="seed = -1"):
         fit(s, "lambertian", seed=-1)
     with pytest.raises(ParameterError, match="max_steps = 0"):
         fit(s, "lambertian", max_steps=0)
-
-
-def test_samples_that_no_parameter_explains_are_named():
-    theta = np.linspace(0.0, 1.2, 5)
-    f = np.array([0.2, 0.2, 1e99, 0.2, 0.2])
-    with pytest.raises(ConvergenceError, match=r"lambertian\.albedo = .* sample 2 should read"):
-        fit(BRDFSamples.plain(theta, 0.0, 0.3, 2.0, f, np.full(5, 1e-80)), "lambertian", seed=1)
 
 
 @pytest.mark.gate
