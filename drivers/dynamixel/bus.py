@@ -1,9 +1,9 @@
 """Several servos on one line: registers, states, and stopping them all.
 
-The state of a servo is one block read of a length that nothing else has, believed only when two in a row agree. Framing
-and CRC are the vendor's (`drivers.dynamixel.sdk`), timeouts and late answers are dealt with in `drivers.dynamixel.line`.
-It refuses Protocol 1.0, whose checksum accepts 1 % of two-bit errors, and never sends from a signal handler. It knows
-counts, not angles.
+The state of a servo is one block read of a length that nothing else has, believed only when two in a row agree; the states
+of several come in by one sync read of the same block. Framing and CRC are the vendor's (`drivers.dynamixel.sdk`), timeouts
+and late answers are dealt with in `drivers.dynamixel.line`. It refuses Protocol 1.0, whose checksum accepts 1 % of two-bit
+errors, and never sends from a signal handler. It knows counts, not angles.
 
 References: ROBOTIS e-manual, DYNAMIXEL Protocol 2.0 (emanual.robotis.com/docs/en/dxl/protocol2).
 """

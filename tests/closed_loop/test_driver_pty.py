@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from drivers.dynamixel import Bus, Servo
+from drivers.dynamixel import registers as reg
 from drivers.scpi_lamp import ScpiLamp
 from drivers.serial_port import open_port
 from gonio.errors import DeviceError, DeviceTimeoutError
@@ -140,7 +141,7 @@ class Unplugged:
     def __init__(self, folder: Path) -> None:
         self.folder, self.clock, self.number = folder, ScaledClock(1.0), 0
         self.servo = SimServo(1, initial_counts=2000.0)
-        self.line = DynamixelBus([self.servo])
+        self.line = DynamixelBus([self.servo, SimServo(2)])
         self._stop, self._thread, self._pump = threading.Event(), threading.Thread(), Pump()
         self.plug()
 
@@ -174,6 +175,22 @@ def test_an_adapter_returns_under_another_name(tmp_path: Path) -> None:
     (tmp_path / "adapter9").touch()
     with pytest.raises(DeviceError, match=r"means several ports: .*adapter8, .*adapter9; make it narrower"):
         open_port(f"{tmp_path}/adapter*", baud=57600)
+
+
+def test_an_adapter_returns_between_a_sync_write_and_a_sync_read(tmp_path: Path) -> None:
+    adapter = Unplugged(tmp_path)
+    with Bus(f"{tmp_path}/adapter*", clock=adapter.clock, timeout_s=1.0, drain_s=0.05, return_s=30.0) as bus:
+        assert bus.blocks([1, 2])[1].position == 2000
+        adapter.pull()
+        threading.Timer(0.3, adapter.plug).start()
+        bus.sync_write(reg.GOAL_POSITION, {1: 2100, 2: 2200})
+        assert adapter.number == 2
+        assert [bus.blocks([1, 2])[k].goal for k in (1, 2)] == [2100, 2200]
+        adapter.pull()
+        threading.Timer(0.3, adapter.plug).start()
+        assert [block.goal for block in bus.blocks([1, 2]).values()] == [2100, 2200]
+        assert adapter.number == 3
+        adapter.pull()
 
 
 def test_an_adapter_that_stays_away(tmp_path: Path) -> None:
