@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from gonio import jit
 from gonio.brdf import scattered, tabulated
 from gonio.brdf.base import BRDF, Model, Term
-from gonio.brdf.tabulated import BUCKETS, CELL, _buckets, _cells, _weights, tangents
+from gonio.brdf.packed import BUCKETS, CELL, LARGE, SMALL, buckets, cells, cubic, weights
+from gonio.brdf.tabulated import tangents
 from gonio.errors import DatasetError
 from gonio.halfdiff import directions, half_difference
 from gonio.samples import BRDFSamples
@@ -43,7 +44,7 @@ FEWEST = 60
 def grained_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
     if not (zi > 0.0 and zr > 0.0):
         return 0.0
-    n_q, n_h, n_d, n_p = int(p[0]), int(p[1]), int(p[2]), int(p[3])
+    n_q, n_h, n_d, n_p = int(p[0]) & SMALL, int(p[1]) & SMALL, int(p[2]) & SMALL, int(p[3]) & SMALL
     sx, sy, sz = xi + xr, yi + yr, zi + zr
     ex, ey, ez = xi - xr, yi - yr, zi - zr
     st2 = sx * sx + sy * sy
@@ -58,23 +59,20 @@ def grained_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float
     a = (phi_h / (2.0 * math.pi)) % 1.0 * n_q
     c = (phi_d / math.pi) % 1.0 * n_p
 
-    i = int(p[5 + min(int(math.sqrt(t) * BUCKETS), BUCKETS - 1)])
+    i = int(p[5 + (min(int(math.sqrt(t) * BUCKETS), BUCKETS - 1) & SMALL)]) & SMALL
     while i < n_h - 2 and t > p[START + CELL * (i + 1)]:
         i += 1
-    at = START + CELL * i
+    at = (START + CELL * i) & LARGE
     u = (t - p[at]) * p[at + 1]
-    g, j, k = min(int(a), n_q - 1), min(int(b), n_d - 2), min(int(c), n_p - 1)
-    weights_q, weights_d, weights_p = _weights(a - g), _weights(b - j), _weights(c - k)
-    first = START + CELL * (n_h - 1)
+    g, j, k = min(int(a), n_q - 1) & SMALL, min(int(b), n_d - 2) & SMALL, min(int(c), n_p - 1) & SMALL
+    along, rows, columns = weights(a - g), weights(b - j), weights(c - k)
+    row = n_p + 3
+    plane = ((n_d + 2) * row) & LARGE
+    turn = ((n_h + 2) * plane) & LARGE  # from one azimuth of the half vector to the next
+    first = (START + CELL * (n_h - 1) + g * turn + i * plane + j * row + k) & LARGE
     q = 0.0
-    for l in range(4):
-        for m in range(4):
-            w = at + 2 + 4 * m
-            weight = weights_q[l] * (p[w] + u * (p[w + 1] + u * (p[w + 2] + u * p[w + 3])))
-            for n in range(4):
-                x = first + (((g + l) * (n_h + 2) + i + m) * (n_d + 2) + j + n) * (n_p + 3) + k
-                row = weights_p[0] * p[x] + weights_p[1] * p[x + 1] + weights_p[2] * p[x + 2] + weights_p[3] * p[x + 3]
-                q += weight * weights_d[n] * row
+    for n in range(4):
+        q += along[n] * cubic(p, at + 2, first + n * turn, plane, row, u, rows, columns)
     q = max(q, 0.0)
     q *= q
     return q * q
@@ -195,7 +193,7 @@ def _packed(f: Array, scale: float) -> BRDF:
     root = np.concatenate((root[-1:], root, root[:2]), axis=0)
     t = tangents(f.shape[1], scale)
     head = np.array([*f.shape, BUCKETS], dtype=float)
-    return BRDF([Term(GRAINED, np.concatenate((head, _buckets(t), _cells(t).ravel(), root.ravel())))])
+    return BRDF([Term(GRAINED, np.concatenate((head, buckets(t), cells(t).ravel(), root.ravel())))])
 
 
 def from_brdf(brdf: BRDF, shape: tuple[int, int, int, int] = SHAPE) -> GrainedTable:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf.base import BRDF, Model, Term
+from gonio.brdf.packed import BUCKETS, CELL, LARGE, SMALL, buckets, cells, cubic, weights
 from gonio.errors import DatasetError
 from gonio.halfdiff import directions
 from gonio.samples import BRDFSamples
@@ -38,9 +39,7 @@ Array = NDArray[np.float64]
 SHAPE = (48, 32, 16)  # nodes along theta_h, theta_d, phi_d
 SCALE = 0.1  # of the nodes along theta_h where nothing is known of a lobe
 LEAST_SCALE = 2e-4
-BUCKETS = 256  # of sqrt(t), each with the first cell that reaches into it
 HEAD = 4 + BUCKETS  # sizes and number of buckets, then the buckets, the cells and the values
-CELL = 18  # numbers of a cell: lower end, 1/width, 4 weights of 4 coefficients
 
 BELOW_HORIZON, MEASURED, INTERPOLATED, EXTRAPOLATED, MODEL = 0, 1, 2, 3, 4
 COVERAGE = {
@@ -56,7 +55,7 @@ COVERAGE = {
 def tabulated_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, p: list[float]) -> float:
     if not (zi > 0.0 and zr > 0.0):
         return 0.0
-    n_h, n_d, n_p = int(p[0]), int(p[1]), int(p[2])
+    n_h, n_d, n_p = int(p[0]) & SMALL, int(p[1]) & SMALL, int(p[2]) & SMALL
     # s = wi + wr, |s| = 2 cos theta_d; e = wi - wr, |e| = 2 sin theta_d
     sx, sy, sz = xi + xr, yi + yr, zi + zr
     ex, ey, ez = xi - xr, yi - yr, zi - zr
@@ -69,70 +68,19 @@ def tabulated_f_r(xi: float, yi: float, zi: float, xr: float, yr: float, zr: flo
     length = along + math.sqrt(along * along + across * across)
     c = across / length * (n_p - 1) if length > 0.0 else 0.0
 
-    i = int(p[4 + min(int(math.sqrt(t) * BUCKETS), BUCKETS - 1)])
+    i = int(p[4 + (min(int(math.sqrt(t) * BUCKETS), BUCKETS - 1) & SMALL)]) & SMALL
     while i < n_h - 2 and t > p[HEAD + CELL * (i + 1)]:
         i += 1
-    at = HEAD + CELL * i
+    at = (HEAD + CELL * i) & LARGE
     u = (t - p[at]) * p[at + 1]
-    j, k = min(int(b), n_d - 2), min(int(c), n_p - 2)
-    v, w = b - j, c - k
-    v0, v1, v2, v3 = _weights(v)
-    w0, w1, w2, w3 = _weights(w)
+    j, k = min(int(b), n_d - 2) & SMALL, min(int(c), n_p - 2) & SMALL
     # the table has a row of mirrored nodes before its first and after its last one, so all 64 values are there
     plane, row = (n_d + 2) * (n_p + 2), n_p + 2
-    first = HEAD + CELL * (n_h - 1) + i * plane + j * row + k
-    q = 0.0
-    for m in range(4):
-        g = at + 2 + 4 * m
-        weight = p[g] + u * (p[g + 1] + u * (p[g + 2] + u * p[g + 3]))
-        x = first + m * plane
-        r0 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
-        x += row
-        r1 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
-        x += row
-        r2 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
-        x += row
-        r3 = w0 * p[x] + w1 * p[x + 1] + w2 * p[x + 2] + w3 * p[x + 3]
-        q += weight * (v0 * r0 + v1 * r1 + v2 * r2 + v3 * r3)
+    first = (HEAD + CELL * (n_h - 1) + i * plane + j * row + k) & LARGE
+    q: float = cubic(p, at + 2, first, plane, row, u, weights(b - j), weights(c - k))
     q = max(q, 0.0)
     q *= q
     return q * q
-
-
-@jit.model
-def _weights(t: float) -> tuple[float, float, float, float]:
-    """Catmull-Rom weights of four even nodes at fraction t between the middle two."""
-    return (
-        t * (-0.5 + t * (1.0 - 0.5 * t)),
-        1.0 + t * t * (1.5 * t - 2.5),
-        t * (0.5 + t * (2.0 - 1.5 * t)),
-        t * t * (0.5 * t - 0.5),
-    )
-
-
-def _cells(t: Array) -> Array:
-    """Lower end, 1/width and the 4 x 4 coefficients of the weights of the nodes around each cell, shape (n - 1, CELL).
-
-    The function is even about t = 0 and level beyond the last node.
-    """
-    before, after = np.concatenate(([-t[1]], t[:-2])), np.concatenate((t[2:], [2 * t[-1] - t[-2]]))
-    low, high = t[:-1], t[1:]
-    d0, d1, d2 = low - before, high - low, after - high
-    zero, one = np.zeros_like(d1), np.ones_like(d1)
-    # slopes times the width at both ends, of parabolas through three nodes, as weights of the four
-    left = np.stack((-d1 * d1 / (d0 * (d0 + d1)), (d1 - d0) / d0, d0 / (d0 + d1), zero))
-    right = np.stack((zero, -d2 / (d1 + d2), (d2 - d1) / d2, d1 * d1 / (d2 * (d1 + d2))))
-    values = np.stack((zero, one, zero, zero)), np.stack((zero, zero, one, zero))
-    # Hermite: f_1 + left u + (3 (f_2 - f_1) - 2 left - right) u^2 + (2 (f_1 - f_2) + left + right) u^3
-    rise = values[1] - values[0]
-    coefficients = np.stack((values[0], left, 3 * rise - 2 * left - right, left + right - 2 * rise), axis=1)  # (4, 4, n - 1)
-    return np.concatenate((low[:, None], 1.0 / d1[:, None], coefficients.reshape(16, -1).T), axis=1)
-
-
-def _buckets(t: Array) -> Array:
-    """For each even step of sqrt(t) the cell that holds its beginning."""
-    start = (np.arange(BUCKETS) / BUCKETS) ** 2
-    return np.clip(np.searchsorted(t, start * (1 - 1e-12), side="right") - 1, 0, len(t) - 2).astype(float)
 
 
 def _lobe_width(packed: Array) -> float:
@@ -348,7 +296,7 @@ def _packed(f: Array, scale: float) -> BRDF:
     root = np.concatenate((root[:, :, 1:2], root, root[:, :, -2:-1]), axis=2)
     t = tangents(f.shape[0], scale)
     head = np.array([*f.shape, BUCKETS], dtype=float)
-    return BRDF([Term(TABULATED, np.concatenate((head, _buckets(t), _cells(t).ravel(), root.ravel())))])
+    return BRDF([Term(TABULATED, np.concatenate((head, buckets(t), cells(t).ravel(), root.ravel())))])
 
 
 def from_brdf(brdf: BRDF, shape: tuple[int, int, int] = SHAPE, scale: float | None = None) -> TabulatedBRDF:
