@@ -33,12 +33,12 @@ lint: $(STAMP)
 gates: $(STAMP)
 	$(BIN)/python -m pytest -m gate -s
 
-# The renderer is a peer worth having, and large; where it cannot be installed, its rows are left out.
+# The renderer and NUTS are peers worth having, and large; where they cannot be installed, their rows are left out.
 bench: $(STAMP)
-	@$(BIN)/python -c 'import mitsuba' 2>/dev/null || { \
+	@$(BIN)/python -c 'import mitsuba, numpyro' 2>/dev/null || { \
 	  if $(BIN)/python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'; then pin="-c constraints.txt"; fi; \
 	  $(BIN)/pip install --quiet --disable-pip-version-check -e '.[bench]' $$pin 2>/dev/null || \
-	  echo "mitsuba cannot be installed here; its rows are left out"; }
+	  echo "mitsuba or numpyro cannot be installed here; their rows are left out"; }
 	$(BIN)/python -m tests.benchmarks
 
 # pySCATMECH comes as source: a C++ compiler and some minutes.

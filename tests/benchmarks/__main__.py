@@ -3,7 +3,7 @@
 Sections: kernels (ns per evaluation against C), models (the same for every model, and what it takes to compile all), targets
 (the maps that gonio promises), accuracy (run time against error, gonio and its peers), size (cost against the size of the
 map), start (of the command line), band (of a posterior), rig (the simulator: motion of a scan, a frame), bus (a cycle on the
-servos' line against its bytes alone).
+servos' line against its bytes alone), fit (effective draws per second, gonio's against a user's script and NUTS).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import time
 
-from tests.benchmarks import accuracy, band, bus, kernels, models, page, rig, size, start, targets
+from tests.benchmarks import accuracy, band, bus, fit, kernels, models, page, rig, size, start, targets
 
-SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig", "bus")
+SECTIONS = ("kernels", "models", "targets", "accuracy", "size", "start", "band", "rig", "bus", "fit")
 INTRODUCTION = """# Benchmarks
 
 What a reflectance map costs, beside what it costs a user who picks something else.
@@ -90,6 +90,8 @@ def main() -> None:
         tell("rig", rig.report(rig.measure(quick=given.quick)))
     if "bus" in chosen:
         tell("bus", bus.report(bus.measure(quick=given.quick)))
+    if "fit" in chosen:
+        tell("fit", fit.report(fit.measure(quick=given.quick)))
     if started is not None and found and results:
         tell("verdicts", page.verdicts(speeds, results, found, costs, started, quick=given.quick))
     if whole:

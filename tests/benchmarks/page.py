@@ -25,7 +25,7 @@ PICTURE = "images/benchmark.png"
 TITLES = {
     "verdicts": "Promises", "accuracy": "Run time against error", "targets": "Maps that gonio promises",
     "size": "Size of the map", "kernels": "One evaluation", "models": "Every model", "start": "Start",
-    "band": "Band of a posterior", "rig": "Simulated rig", "bus": "Servo line",
+    "band": "Band of a posterior", "rig": "Simulated rig", "bus": "Servo line", "fit": "A posterior",
 }  # fmt: skip
 Row = Sequence[str]
 
@@ -59,7 +59,7 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     if info.exists():
         name = next((l.split(":", 1)[1].strip() for l in info.read_text().splitlines() if l.startswith("model name")), name)
-    known = ("numpy", "scipy", "numba", "mitsuba")
+    known = ("numpy", "scipy", "numba", "mitsuba", "emcee", "numpyro")
     packages = ", ".join(f"{p} {version(p)}" for p in known if importlib.util.find_spec(p) is not None)
     load = f"; load average at the start {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
