@@ -1,8 +1,8 @@
 """What every axis, camera and lamp must do, as checks that run on any of them: built in, simulated, plugged in, on a bench.
 
 Each check tries a device and returns what it broke, one sentence each; an empty list is a pass. The author of a camera
-plug-in runs `camera` on it (docs/howto-add-a-camera.md). `axis` moves the axis within the range it is given, `lamp` switches
-the lamp. They know the interfaces of `gonio.interfaces` and nothing else.
+plug-in runs `camera` on it (docs/howto-add-a-camera.md). `axis` and `axis_group` move axes within the ranges they are given,
+`lamp` switches the lamp. They know the interfaces of `gonio.interfaces` and nothing else.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from gonio.errors import ConfigurationError, GonioError, LimitError
-from gonio.interfaces import Axis, Camera, Clock, Frame, Lamp
+from gonio.interfaces import Axis, AxisGroup, Camera, Clock, Frame, Lamp
 
 _POLL_S = 0.02
 _NOT_EXPOSURES = (0.0, -1.0, math.nan, math.inf)
@@ -120,6 +120,45 @@ def axis(device: Axis, lower: float, upper: float, clock: Clock, *, timeout_s: f
     device.move_to(lower)
     if not _settles(device, clock, timeout_s):
         broken.append("it does not go on after stop()")
+    return broken
+
+
+def axis_group(
+    group: AxisGroup, ranges: Mapping[str, tuple[float, float]], clock: Clock, *, timeout_s: float = 60.0
+) -> list[str]:
+    """Move all axes together to both ends of their ranges; they end near the upper ones.
+
+    Parameters
+    ----------
+    group : AxisGroup
+    ranges : mapping of axis name to (float, float)
+        Within the limits of each axis, in which nothing is in the way [rad].
+    clock : Clock
+        Of the rig.
+    timeout_s : float, optional
+        For each move, in rig time [s].
+    """
+    broken = []
+    near = math.radians(1.5)
+    for which in (0, 1):
+        goals = {name: ends[which] for name, ends in ranges.items()}
+        group.move_to(goals)
+        waiting, end_s = list(goals), clock.now() + timeout_s
+        while waiting and clock.now() < end_s:
+            clock.sleep(_POLL_S)
+            waiting = [name for name, settled in group.settled(waiting).items() if not settled]
+        broken += [f"{name} is not settled {timeout_s:g} s after move_to" for name in waiting]
+        readings = group.read()
+        for name, goal in goals.items():
+            angle = readings[name].angle
+            if abs(angle - goal) > near or readings[name].moving:
+                broken.append(f"{name} reads {math.degrees(angle):.2f} deg at rest, its goal was {math.degrees(goal):g} deg")
+    before = {name: reading.goal_counts for name, reading in group.read().items()}
+    names = list(ranges)
+    beyond = {names[0]: ranges[names[0]][0], names[-1]: math.nan}
+    broken += _refuses(functools.partial(group.move_to, beyond), LimitError, f"move_to with {names[-1]} at nan")
+    if {name: reading.goal_counts for name, reading in group.read().items()} != before:
+        broken.append("a move of which one goal was refused changed a goal")
     return broken
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from drivers.scpi_lamp import ManualLamp
 from gonio import contracts
 from gonio.config import RigConfig, default_documents, load_rig, parse_rig
 from gonio.errors import DeviceError
-from gonio.interfaces import Axis, AxisReading, Camera, Frame, Lamp
+from gonio.interfaces import Axis, AxisGroup, AxisReading, Camera, Frame, Lamp
 from gonio.rig import Rig, WallClock, open_rig
 
 RIG = parse_rig(default_documents()["rig.toml"])
@@ -51,6 +51,13 @@ def test_axes(rig: Rig, name: str) -> None:
     assert isinstance(axis, Axis)
     third = (axis.limits.upper - axis.limits.lower) / 3.0
     assert contracts.axis(axis, axis.limits.lower + third, axis.limits.upper - third, rig.clock) == []
+
+
+def test_axes_together(rig: Rig) -> None:
+    assert isinstance(rig.group, AxisGroup)
+    thirds = {name: (axis.limits.upper - axis.limits.lower) / 3.0 for name, axis in rig.axes.items()}
+    ranges = {n: (rig.axes[n].limits.lower + third, rig.axes[n].limits.upper - third) for n, third in thirds.items()}
+    assert contracts.axis_group(rig.group, ranges, rig.clock) == []
 
 
 def test_camera_of_a_rig(rig: Rig) -> None:
@@ -123,6 +130,23 @@ class Runaway:
         return {}
 
 
+class Herd:
+    """Axes of which the second never arrives; they take every goal."""
+
+    def __init__(self) -> None:
+        self.goals = {"a": 0.0, "b": 0.0}
+
+    def move_to(self, goals: Mapping[str, float]) -> None:
+        self.goals |= goals
+
+    def settled(self, names: Collection[str]) -> dict[str, bool]:
+        return {name: name == "a" for name in names}
+
+    def read(self) -> dict[str, AxisReading]:
+        a, b = self.goals["a"], 0.0
+        return {"a": AxisReading(a, 0, round(1e3 * a), 0.0, False), "b": AxisReading(b, 0, 0, 0.0, True)}
+
+
 class Boundless:
     """A lamp that takes every level."""
 
@@ -147,6 +171,13 @@ def test_breaches_are_told() -> None:
         assert breach in told
     told = "\n".join(contracts.axis(Runaway(), -0.5, 0.5, WallClock()))  # type: ignore[arg-type]
     assert "its goal was -28.6479 deg" in told and "is taken; it must raise LimitError" in told
+    told = "\n".join(contracts.axis_group(Herd(), {"a": (-0.5, 0.5), "b": (-0.5, 0.5)}, WallClock(), timeout_s=0.05))
+    for breach in (
+        "b is not settled 0.05 s after", "b reads 0.00 deg at rest, its goal was 28.6479 deg", "b at nan is taken",
+        "one goal was refused changed a goal",
+    ):  # fmt: skip
+        assert breach in told
+    assert "a reads" not in told
     told = "\n".join(contracts.lamp(Boundless()))
     assert "a level of 1.01 is taken; it must raise ConfigurationError" in told and "not JSON-compatible" in told
 
