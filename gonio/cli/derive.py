@@ -49,6 +49,11 @@ def table(run: Path, fill: bool, channel: str | None, as_json: bool) -> None:
 @RUN
 @fit_choices
 @click.option("--seed", type=int, help="Of the sampler; 1 by default.")
+@click.option("--student", type=float, metavar="NU", help="Student's t with NU degrees of freedom in place of Gauss.")
+@click.option("--chain", is_flag=True, help="Walk with emcee even where importance sampling would do.")
+@click.option("--max-steps", type=int, help="Longest chain.")
+@click.option("--resume", is_flag=True, help="Go on with the chains of posterior.nc; the other options as then.")
+@click.option("--threads", type=int, default=1, help="For the likelihood; the numbers do not depend on it.")
 @json_option
 def fit(
     run: Path,
@@ -57,12 +62,21 @@ def fit(
     free: tuple[str, ...],
     fix: tuple[str, ...],
     seed: int | None,
+    student: float | None,
+    chain: bool,
+    max_steps: int | None,
+    resume: bool,
+    threads: int,
     as_json: bool,
 ) -> None:
-    """Fit a model to the samples of RUN with MCMC (posterior.nc); exit code 5 if the chains did not converge."""
+    """Fit a model to the samples of RUN (posterior.nc); exit code 5 if the chains did not converge."""
     model, given_seed, options = chosen_fit(model, config, free, fix)
     seed = given_seed if seed is None else seed
+    given = {"student": student, "max_steps": max_steps}
+    options |= {key: value for key, value in given.items() if value is not None} | {"chain": chain, "threads": threads}
     with speaking(as_json) as output, steps.open_run(run) as opened:
+        if resume:
+            options["resume"] = steps.load_posterior(opened)
         posterior = steps.fit(opened, output, model, seed, **options)
         steps.show_fit(output, posterior)
         if not posterior.diagnostics.get("converged"):

@@ -45,6 +45,8 @@ def chosen_fit(
         options["priors"] = dict(chosen.priors)
     if chosen and chosen.max_steps:
         options["max_steps"] = chosen.max_steps
+    if chosen and chosen.student:
+        options["student"] = chosen.student
     return model, chosen.seed if chosen else 1, options
 
 

@@ -66,8 +66,8 @@ def _insist(key: str, names: Iterable[str], angles: set[str]) -> None:
             raise ConfigurationError(f"{key}: {name} has no unit; write {name}{DEG}, in degrees")
 
 
-def _prior(prior: tuple[str, float, float]) -> tuple[str, float, float]:
-    kind, a, b = prior
+def _prior(prior: tuple[Any, ...]) -> tuple[Any, ...]:
+    kind, *numbers = prior
     if kind == "log_normal":
-        return kind, a + math.log(_DEGREE), b
-    return kind, a * _DEGREE, b * _DEGREE
+        return kind, numbers[0] + math.log(_DEGREE), numbers[1]
+    return kind, *(number * _DEGREE for number in numbers)

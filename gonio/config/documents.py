@@ -11,13 +11,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gonio.config.reader import Document, Table, read_document
 
 _DIRECTIONS = ("theta_i_deg", "theta_r_deg", "phi_deg")
 _HALF = ("theta_h_deg", "theta_d_deg", "phi_d_deg")
 MAX_POSES = 2_000_000
+
+
+# numbers that a prior takes
+_NUMBERS = {"uniform": 2, "log_uniform": 2, "normal": 2, "log_normal": 2, "half_normal": 1}
 
 
 @dataclass(frozen=True)
@@ -80,14 +84,15 @@ class PlanConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """A fit: model, parameters freed, fixed and with other priors, seed, largest number of steps."""
+    """A fit: model, parameters freed, fixed and with other priors, seed, largest number of steps, freedom of Student's t."""
 
     model: str
     free: tuple[str, ...]
     fix: Mapping[str, float]
-    priors: Mapping[str, tuple[str, float, float]]
+    priors: Mapping[str, tuple[Any, ...]]
     seed: int
     max_steps: int | None
+    student: float | None
 
 
 def load_plan(path: str | Path) -> PlanConfig:
@@ -161,6 +166,7 @@ def parse_fit(text: str, name: str = "fit.toml") -> FitConfig:
         priors=_priors(priors),
         seed=root.integer("seed", 1, lower=0),
         max_steps=root.integer("max_steps", lower=100, upper=10**8, unit="steps") if "max_steps" in root else None,
+        student=root.number("student", lower=1.0, upper=1e6) if "student" in root else None,
     )
     root.finish()
     document.finish()
@@ -197,16 +203,20 @@ def _poses(table: Table) -> tuple[tuple[float, float, float], ...]:
     return tuple(poses)
 
 
-def _priors(table: Table, prefix: str = "") -> dict[str, tuple[str, float, float]]:
-    found: dict[str, tuple[str, float, float]] = {}
+def _priors(table: Table, prefix: str = "") -> dict[str, tuple[Any, ...]]:
+    found: dict[str, tuple[Any, ...]] = {}
     for key, value in table.free().items():
         if isinstance(value, dict):
             found.update(_priors(table.table(key), f"{prefix}{key}."))
         elif (
-            isinstance(value, list) and len(value) == 3 and value[0] in ("uniform", "log_normal")
+            isinstance(value, list) and value and _NUMBERS.get(str(value[0])) == len(value) - 1
             and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value[1:])
         ):  # fmt: skip
-            found[prefix + key] = (value[0], float(value[1]), float(value[2]))
+            found[prefix + key] = (value[0], *map(float, value[1:]))
         else:
-            table.report(key, f'is {value!r}; write ["uniform", lower, upper] or ["log_normal", mean of ln, sd of ln]')
+            table.report(
+                key,
+                f'is {value!r}; write ["uniform", lower, upper], ["log_uniform", lower, upper], ["normal", mean, sd], '
+                '["log_normal", mean of ln, sd of ln] or ["half_normal", sd]',
+            )
     return found

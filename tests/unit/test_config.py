@@ -191,6 +191,11 @@ def test_fit_priors() -> None:
     assert fit.priors == {"ggx.alpha": ("log_normal", -1.6, 1.0)}
     with pytest.raises(ConfigurationError, match='write \\["uniform"'):
         config.parse_fit('model = "ggx"\n[priors]\n"ggx.alpha" = 3\n')
+    with pytest.raises(ConfigurationError, match=r"half_normal"):
+        config.parse_fit('model = "ggx"\n[priors]\n"ggx.alpha" = ["half_normal", 1, 2]\n')
+    text = 'model = "ggx"\nstudent = 4\n[priors]\n"ggx.f_0" = ["half_normal", 0.1]\n"ggx.alpha" = ["normal", 0.2, 0.1]\n'
+    assert config.parse_fit(text).priors == {"ggx.f_0": ("half_normal", 0.1), "ggx.alpha": ("normal", 0.2, 0.1)}
+    assert config.parse_fit(text).student == 4.0
 
 
 def test_the_reader_loads_no_numerical_package() -> None:

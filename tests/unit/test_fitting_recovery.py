@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from fitting import Rule, fit
-from gonio.errors import ParameterError
+from gonio.errors import DatasetError, ParameterError
+from gonio.posterior import Posterior
 from gonio.samples import BRDFSamples, SharedError
 from tests.measurements import measure
 
@@ -151,6 +152,58 @@ def test_one_seed_gives_the_same_bytes():
     assert one.draws.tobytes() == two.draws.tobytes()
     assert one.diagnostics == two.diagnostics
     assert one.draws.tobytes() != fit(s, seed=10, rule=rule).draws.tobytes()
+
+
+def test_a_fit_goes_on_from_its_file(tmp_path):
+    """Chains that stopped at 200 steps, saved, loaded and resumed to 400: the bytes of a fit of 400."""
+    s = scan(5, 40).samples
+    short, long = (Rule(ensembles=2, taus=1e6, first=100, max_steps=steps) for steps in (200, 400))
+    half = fit(s, seed=9, chain=True, rule=short)
+    assert not half.converged
+    half.save(tmp_path / "posterior.nc")
+    loaded = Posterior.load(tmp_path / "posterior.nc")
+    both = fit(s, seed=9, chain=True, rule=long, resume=loaded)
+    whole = fit(s, seed=9, chain=True, rule=long)
+    assert both.draws.tobytes() == whole.draws.tobytes()
+    assert both.diagnostics == whole.diagnostics
+    with pytest.raises(DatasetError, match="cannot go on: they are of other samples"):
+        fit(s, seed=8, chain=True, rule=long, resume=loaded)
+    with pytest.raises(DatasetError, match="cannot go on: they have converged"):
+        fit(s, seed=9, rule=long, resume=fit(s, seed=9, shared=False))
+
+
+def test_stray_readings_pull_gauss_and_not_student():
+    """One reading in 20 is 30 % too high: Gauss's albedo is off by many sd, that of t with 4 degrees of freedom is not."""
+    s = scan(6, 120)
+    stray = np.arange(120) % 20 == 0
+    spoiled = replace(s.samples, f_r=np.where(stray, 1.3 * s.samples.f_r, s.samples.f_r))
+    gauss = fit(spoiled, seed=1, discrepancy=False)
+    student = fit(spoiled, seed=1, student=4.0)
+    assert max(abs(p) for p in pulls(gauss, s.truth).values()) > 4.0
+    assert max(abs(p) for p in pulls(student, s.truth).values()) < 3.5
+    assert set(np.flatnonzero(stray)) <= set(student.diagnostics["outliers"])
+    assert "Student's t gives them little weight" in " ".join(student.diagnostics["advice"])
+    with pytest.raises(ParameterError, match=r"student = 0.5 degrees of freedom"):
+        fit(spoiled, student=0.5)
+
+
+def test_threads_change_no_number():
+    s = scan(5, 40).samples
+    one, two = (fit(s, seed=9, threads=threads, rule=Rule(effective=400)) for threads in (1, 2))
+    assert one.draws.tobytes() == two.draws.tobytes()
+    assert one.diagnostics == two.diagnostics
+
+
+def test_a_common_factor_of_the_uncertainties_is_inferred():
+    """Uncertainties stated at half their size: noise.scale = 2, with the relative error 1 / sqrt(2 N)."""
+    s = scan(7, 300).samples
+    quiet = replace(s, u_f_r=0.5 * s.u_f_r, shared=tuple(replace(e, u_sample=0.0) for e in s.shared))
+    posterior = fit(quiet, seed=1, free=["noise.scale"])
+    assert posterior.diagnostics["marginalised"] == ["lambertian.albedo", "ggx.f_0", "noise.scale"]
+    scale = posterior.summary()["noise.scale"]
+    assert scale["sd"] == pytest.approx(scale["mean"] / math.sqrt(600), rel=0.1)
+    assert abs(scale["mean"] - 2.0) < 0.5  # the encoder's errors are in the scatter as well
+    assert "noise.scale" in " ".join(posterior.diagnostics["advice"])
 
 
 def test_more_samples_than_asked_for_are_cut_and_said():
