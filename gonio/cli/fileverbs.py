@@ -1,4 +1,4 @@
-"""gonio info, convert, check-file: files of anyone, without a run."""
+"""gonio convert, check-file: files of anyone, without a run."""
 
 from __future__ import annotations
 
@@ -15,31 +15,7 @@ if TYPE_CHECKING:
     from gonio.samples import BRDFSamples
 
 FILE = click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-QUANTITY = click.option(
-    "--quantity", type=click.Choice(["brdf", "brf", "brdf_cos"]), help="What the values are, where the file does not say."
-)
 DENSE = 12  # incidences from which a table is believed to interpolate between them
-
-
-@click.command()
-@FILE
-@QUANTITY
-@json_option
-def info(file: Path, quantity: str | None, as_json: bool) -> None:
-    """Say what FILE holds: format, quantity, units, conventions, channels, coverage, energy, reciprocity."""
-    from gonio.formats.summary import describe
-
-    with speaking(as_json) as output:
-        found = describe(file, quantity)
-        attributes = found.pop("attributes")
-        output.say(f"{file.name}: {found['format_doc']}, {found['bytes']} bytes")
-        output.say("    angles: from the normal, mirror direction at phi_r = phi_i + 180 degrees, read as radians")
-        for key, value in found.items():
-            if key not in ("file", "bytes", "format_doc"):
-                output.say(f"    {key}: {_shown(value)}")
-        for key, value in attributes.items():
-            output.say(f"    {key}: {value[:200]}")
-        output.result(**found, attributes=attributes)
 
 
 @click.command()
@@ -48,7 +24,9 @@ def info(file: Path, quantity: str | None, as_json: bool) -> None:
 @click.option(
     "--format", "name", required=True, help="Format of OUT, such as rgl, klems, merl, bird, netcdf; see the guide."
 )
-@QUANTITY
+@click.option(
+    "--quantity", type=click.Choice(["brdf", "brf", "brdf_cos"]), help="What the values are, where the file does not say."
+)
 @click.option("--channel", help="One channel only, such as red or 550nm.")
 @click.option("--model", help="Fit this model, such as lambertian+ggx, and write it where the format needs every direction.")
 @json_option
@@ -154,13 +132,3 @@ def _quantity(form: Any) -> str:
     from gonio.formats.quantity import QUANTITIES
 
     return QUANTITIES[form.quantity or "brdf"]
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.5g}"
-    if isinstance(value, list):
-        return ", ".join(_shown(v) for v in value)
-    if isinstance(value, dict):
-        return ", ".join(f"{v} {k}" for k, v in value.items())
-    return str(value)

@@ -31,7 +31,7 @@ VERBS: dict[str, tuple[str, str, str]] = {
     "map": ("gonio.cli.map", "map_", "Reflectance map R(p, q) of a scene."),
     "export": ("gonio.cli.export", "export", "Write the data set in another format."),
     "convert": ("gonio.cli.fileverbs", "convert", "A file of one format to another."),
-    "info": ("gonio.cli.fileverbs", "info", "Say what a file holds."),
+    "info": ("gonio.cli.info", "info", "Say what a file holds."),
     "check-file": ("gonio.cli.fileverbs", "check_file", "Read a file again through other people's programs."),
     "bundle": ("gonio.cli.bundle", "bundle", "Make a folder for publication from a run."),
     "report": ("gonio.cli.derive", "report", "Plots and a single-file HTML report."),

@@ -32,9 +32,8 @@ def check(path: Path) -> list[Result]:
     """All programs that can read the format; `DatasetError` if gonio itself cannot read the file."""
     name = formats.sniff(path)
     found = formats.read(path)
-    mine = (
-        "a table" if not isinstance(found, ChannelSamples) else f"{len(found)} directions in {len(found.channels)} channels"
-    )
+    n = len(found.channels) if isinstance(found, ChannelSamples) else 1
+    mine = "a table" if isinstance(found, Tables) else f"{len(found)} directions in {n} channel{'s' * (n > 1)}"
     out = [Result("gonio", f"{formats.FORMATS[name].doc}, {mine}", None)]
     there = peers.installed()
     for program, reader, function in _READERS.get(name, ()):

@@ -9,7 +9,7 @@ The database's own code, and most readers after it, give every direction pair of
 written is the bin's mean, weighted with cos(theta_i) cos(theta_r) d omega_i d omega_r as far as it is above the horizon:
 then such a reader reflects the right energy. (Values at the edges of bins would make a metal of alpha = 0.1 reflect 7 % too
 much.) A program that takes the lower edges for nodes and interpolates sees the lobe shifted by half a bin; docs/formats.md
-has the figures. Read are values at the centres of bins. A single channel is written three times.
+has the figures. Read are values at the centres of bins. A single channel is written three times, and read as one.
 
 References
 ----------
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from gonio import files
 from gonio.brdf.base import BRDF
-from gonio.channels import RGB, ChannelSamples
+from gonio.channels import RGB, SINGLE, ChannelSamples
 from gonio.errors import DatasetError
 from gonio.formats.material import Material
 from gonio.halfdiff import directions
@@ -72,14 +72,17 @@ def read(path: Path) -> ChannelSamples:
         raise DatasetError(f"{path}: no value is valid; the file holds no BRDF")
     theta_i, theta_r = (np.arccos(np.clip(w[..., 2], -1, 1))[keep] for w in (omega_i, omega_r))
     phi_i, phi_r = (np.mod(np.arctan2(w[..., 1], w[..., 0]), 2 * np.pi)[keep] for w in (omega_i, omega_r))
+    value, channels = value[keep], RGB
+    if np.allclose(value, value[:, 1:2], rtol=1e-13, atol=0.0, equal_nan=True):
+        value, channels = value[:, 1:2], SINGLE
     attributes = {
         "quantity": "brdf",
-        "source_quantity": "brdf, linear RGB",
+        "source_quantity": "brdf, linear RGB" if channels is RGB else "brdf, three equal channels read as one",
         "source_format": "merl",
         "n_missing": str(int(np.count_nonzero(above & ~valid))),
         "thinning": f"{np.count_nonzero(keep)} of {CELLS} bins, scattered evenly, at their centres",
     }
-    return ChannelSamples.make(theta_i, phi_i, theta_r, phi_r, value[keep], RGB, attributes=attributes)
+    return ChannelSamples.make(theta_i, phi_i, theta_r, phi_r, value, channels, attributes=attributes)
 
 
 def read_planes(path: Path) -> Array:

@@ -21,9 +21,9 @@ from gonio.source import uniform
 
 Array = NDArray[np.float64]
 ALBEDO_DEG = (0.0, 30.0, 60.0)
-MOST = 4000  # samples of which a table is made to judge the energy
+MOST = 20_000  # samples of which a table is made to judge the energy
 SAME = 1e-4  # directions closer than this [rad] count as one
-FULL_HEMISPHERE_BINS = 12 * 6  # of azimuth and of polar angle
+HEMISPHERE_BINS = 6 * 6  # of azimuth, from the incident to the mirror side, and of polar angle
 
 
 def describe(path: Path, quantity: str | None = None) -> dict[str, Any]:
@@ -65,8 +65,8 @@ def coverage_of(samples: BRDFSamples) -> dict[str, Any]:
     """Which directions there are, and how far up the values and uncertainties go."""
     incidence = np.unique(np.round(np.degrees(samples.theta_i), 3))
     azimuth = np.unique(np.round(np.degrees(samples.phi_i), 3))
-    relative = np.mod(samples.phi_r - samples.phi_i, 2 * np.pi)
-    of_azimuth = np.minimum(np.floor(relative / (2 * np.pi) * 12 + 1e-9), 11).astype(int)
+    relative = np.arccos(np.clip(np.cos(samples.phi_r - samples.phi_i), -1.0, 1.0))  # both sides of the plane count as one
+    of_azimuth = np.minimum(np.floor(relative / np.pi * 6 + 1e-9), 5).astype(int)
     bins = of_azimuth * 6 + np.minimum(np.floor(samples.theta_r / (np.pi / 2) * 6), 5).astype(int)
     known = np.isfinite(samples.u_f_r)
     out: dict[str, Any] = {
@@ -74,7 +74,7 @@ def coverage_of(samples: BRDFSamples) -> dict[str, Any]:
         "n_incidences": len(incidence),
         "n_incident_azimuths": len(azimuth),
         "theta_r_deg": [float(np.degrees(samples.theta_r.min())), float(np.degrees(samples.theta_r.max()))],
-        "hemisphere_covered": len(np.unique(bins)) / FULL_HEMISPHERE_BINS,
+        "hemisphere_covered": len(np.unique(bins)) / HEMISPHERE_BINS,
         "f_r": [float(samples.f_r.min()), float(samples.f_r.max())],
         "with_uncertainty": int(np.count_nonzero(known)),
         "negative": int(np.count_nonzero(samples.f_r < 0)),
@@ -113,7 +113,7 @@ def energy_of(data: BRDFSamples | Tables) -> dict[str, Any]:
             brdf = data.brdf()
         else:
             take = np.random.default_rng(0).permutation(len(data))[:MOST]
-            brdf = tabulate(data.select(np.sort(take)), shape=(24, 16, 8)).brdf()
+            brdf = tabulate(data.select(np.sort(take))).brdf()
         albedo = [_albedo(brdf, float(np.radians(a))) for a in ALBEDO_DEG]
     except (DatasetError, IntegrationError) as error:
         return {"energy": f"not known: {error}"}

@@ -217,9 +217,17 @@ def test_read_gives_scattered_samples_of_the_truth(file: Path, truth: gonio.BRDF
     assert np.sqrt(np.mean(error[high] ** 2)) < 1e-3 and abs(np.mean(error[high])) < 4e-4
     assert np.all(np.isnan(samples.u_f_r))
     assert samples.attributes["n_missing"] == "0" and samples.attributes["source_file"] == "paint.binary"
-    np.testing.assert_allclose(formats.read_samples(file, channel="blue").f_r, samples.f_r, rtol=1e-10)
+    assert len(formats.read_channels(file).channels) == 1  # three equal planes
+
+
+def test_read_gives_colours(file: Path, tmp_path: Path) -> None:
+    data = np.frombuffer(file.read_bytes(), dtype="<f8", offset=12).reshape(3, 90, 90, 180)
+    coloured = np.where(data < 0, data, data * np.array([0.5, 1.0, 2.0])[:, None, None, None])
+    (tmp_path / "a").write_bytes(file.read_bytes()[:12] + coloured.tobytes())
+    red, green, blue = (formats.read_samples(tmp_path / "a", channel=name).f_r for name in ("red", "green", "blue"))
+    np.testing.assert_allclose(np.stack((red, blue)), np.stack((0.5 * green, 2 * green)), rtol=1e-14)
     with pytest.raises(ConfigurationError, match="no channel 'infrared'"):
-        formats.read_samples(file, channel="infrared")
+        formats.read_samples(tmp_path / "a", channel="infrared")
 
 
 def test_file_to_table(file: Path, truth: gonio.BRDF) -> None:

@@ -38,6 +38,21 @@ def test_info_says_what_the_file_holds(capsys: pytest.CaptureFixture[str]) -> No
     assert found["reciprocal_pairs"] == 10 and 0.01 < float(found["reciprocity_rms"]) < 0.3  # type: ignore[arg-type]
 
 
+def test_info_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    formats.export("alta", tmp_path / "a", samples=materials.rgb().rows())
+    assert main(["info", str(BLACK)]) == 0 and main(["info", str(tmp_path / "a")]) == 0
+    said = capsys.readouterr().out
+    for words in (
+        "samples       647 in one channel (value); f_r 0.005674 to 1.868 1/sr",
+        "uncertainty   none in the file",
+        "4 incidences (10, 30, 50, 70 degrees) at 1 azimuth; theta_r 0 to 80 degrees",
+        "10 pairs of swapped directions differ by",
+        "energy        conserved; directional albedo",
+        "in 3 channels (red, green, blue)",
+    ):
+        assert words in said
+
+
 def test_info_of_a_file_that_makes_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     material = materials.Material((3.0 * materials.paint(0.9, 0.5),))
     formats.export("csv", tmp_path / "a.csv", material=material)
