@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -26,6 +25,7 @@ from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
 _FEW = 64  # gradients up to which a table in theta_n does not pay
+_MOST_BESIDE = 256  # gradients that are done one by one where a table in theta_n falls short
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
 _CELLS = 1 << 20  # with which gradients may be done that rings leave above their tolerance: seconds
 _FEW_CELLS, _FEW_WAVES = 1 << 10, 256  # so many cells cost a gradient less than twice as many waves
@@ -72,6 +72,8 @@ class Run:
             if step is not together[0]:
                 return together[0].error
             return self._tree(together, step.part, count, value, error)
+        if step.method is Method.RADIAL and isinstance(step.part, Cap) and self.gradients.size > _FEW:
+            return self._radial(step, step.part, count, value, error)
         if step.method is Method.RINGS and isinstance(step.part, Field):
             return self._rings(step, step.part, count, value, error)
         elements = self.gradients.elements()
@@ -91,9 +93,6 @@ class Run:
             return None
         if step.method is Method.LAMBERT:
             return lambda tile, value, error: diffuse.add(term, part, grid, tile, value, error)
-        if step.method is Method.RADIAL and grid.size > _FEW:
-            table = self._table(step, part, threads)
-            return functools.partial(table.add, grid)
         return None
 
     def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
@@ -228,6 +227,22 @@ class Run:
         return integrate_cap(
             term, part, elements, rtol=self.rtol, atol=self.atol, about_normal=None, effort=step.effort, threads=threads
         )
+
+    def _radial(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
+        """By a table in theta_n; a few gradients where that falls short, each by itself."""
+        table, grid = self._table(step, cap, threads), self.gradients
+        if table.relative <= self.rtol:
+            return max(tiling.run(lambda tile: table.add(grid, tile, value, error), grid.tiles(), threads), default=0.0)
+        v, e = np.zeros(grid.size), np.zeros(grid.size)
+        tiling.run(lambda tile: table.add(grid, tile, v, e), grid.tiles(), threads)
+        missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), self.atol))
+        if 0 < missed.size <= _MOST_BESIDE:
+            again, left = self._by_element(step, grid.select(missed).elements(), threads)
+            better = left < e[missed]
+            v[missed[better]], e[missed[better]] = again[better], left[better]
+        value += v
+        error += e
+        return _largest(e, v, 0.0)
 
     def _table(self, step: Step, cap: Cap, threads: int) -> radial.Table:
         def profile(tau: Array) -> tuple[Array, Array]:
