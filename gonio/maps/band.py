@@ -34,6 +34,7 @@ from gonio.brdf.base import BRDF, Model, accumulate
 from gonio.geometry import unit_vector
 from gonio.integrate import threads
 from gonio.integrate.results import MapValues
+from gonio.maps.simultaneous import band_of_products
 
 Array = NDArray[np.float64]
 Evaluate = Callable[[BRDF], MapValues]
@@ -58,11 +59,14 @@ class Band:
         Of each of them, as quantiles of these draws.
     maps : int
         How many maps were made, each of one term.
+    whole : ndarray, shape (2, m, n)
+        Simultaneous band (`gonio.maps.simultaneous`).
     """
 
     value: Array
     error: Array
     maps: int
+    whole: Array
 
 
 def band_of(
@@ -111,12 +115,12 @@ def band_of(
             break
         for one in late:
             one.extend()
-    value = _quantiles(
-        np.concatenate([one.weights for one in shares], axis=1), [part for one in shares for part in one.parts], quantiles
-    )
+    weights = np.concatenate([one.weights for one in shares], axis=1)
+    parts = [part for one in shares for part in one.parts]
+    value, whole = _quantiles(weights, parts, quantiles), band_of_products(weights, parts)
     if progress is not None:
         progress(len(draws))
-    return Band(value, np.sum([one.missed + one.carried() for one in shares], axis=0), made)
+    return Band(value, np.sum([one.missed + one.carried() for one in shares], axis=0), made, whole)
 
 
 class _Interpolant:

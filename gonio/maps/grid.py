@@ -63,6 +63,8 @@ class ReflectanceMap:
         Rotation of a grained surface's x axis about its normal [rad], the same for all gradients.
     band_error : ndarray, shape (m, n), optional
         Of both ends of the band, as quantiles of the draws it was made of.
+    band_whole : ndarray, shape (2, m, n), optional
+        Simultaneous band: the whole map lies inside with a probability of 95 % (`gonio.maps.simultaneous`).
     """
 
     p: Array
@@ -78,6 +80,7 @@ class ReflectanceMap:
     viewer: tuple[float, float] | None = None
     tangent: float | None = None
     band_error: Array | None = None
+    band_whole: Array | None = None
 
     @property
     def has_scene(self) -> bool:
@@ -223,6 +226,9 @@ class ReflectanceMap:
             data["R_band"] = (("quantile", "q", "p"), self.band, {"long_name": text, **unit})
         if self.band_error is not None:
             data["R_band_error"] = (("q", "p"), self.band_error, {"long_name": "error of the band", **unit})
+        if self.band_whole is not None:
+            text = "ends of the band that holds the whole map with a probability of 95 %"
+            data["R_band_whole"] = (("end", "q", "p"), self.band_whole, {"long_name": text, **unit})
         coordinates: dict[str, Any] = {
             "p": ("p", self.p, {"long_name": "surface gradient dz/dx", "units": "1"}),
             "q": ("q", self.q, {"long_name": "surface gradient dz/dy", "units": "1"}),
@@ -270,6 +276,7 @@ class ReflectanceMap:
                     viewer=None if viewer is None else (float(viewer[0]), float(viewer[1])),
                     tangent=None if tangent is None else float(tangent),
                     band_error=data["R_band_error"].to_numpy() if "R_band_error" in data else None,
+                    band_whole=data["R_band_whole"].to_numpy() if "R_band_whole" in data else None,
                 )
         except FileNotFoundError:
             raise DatasetError(f"{path}: there is no such file; make it with: gonio map SCENE.toml --out {path}") from None
@@ -342,6 +349,7 @@ def compute(
     made = ReflectanceMap(
         p, q, values.value, values.error, None if band is None else band.value, tuple(values.impulses), facing,
         dict(attributes or {}), brdf, source, viewer, tangent, None if band is None else band.error,
+        None if band is None else band.whole,
     )  # fmt: skip
     return made, values
 

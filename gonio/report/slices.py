@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gonio.brdf.base import BRDF
 from gonio.halfdiff import half_difference
+from gonio.maps.simultaneous import band_of_curves
 from gonio.report import style
 from gonio.report.residuals import Residuals
 from gonio.samples import BRDFSamples
@@ -47,7 +48,8 @@ def brdf_slices(
     brdf : BRDF, optional
         The fitted model.
     band : sequence of BRDF, optional
-        Draws of the posterior; the central 68 % at each angle are shaded.
+        Draws of the posterior; the central 68 % at each angle are shaded, and lighter the band that holds 95 % of the curves
+        as a whole.
     truth, table : BRDF, optional
         The BRDF that the samples came from, where it is known, and the tabulated one.
     count : int, optional
@@ -261,7 +263,10 @@ def _slice(
         return one.f_r(theta_i, 0.0, np.abs(_SIGNED), np.where(_SIGNED >= 0.0, np.pi, 0.0))
 
     if band:
-        low, high = np.quantile([along(one) for one in band], [0.16, 0.84], axis=0)
+        drawn = np.array([along(one) for one in band])
+        low, high = band_of_curves(drawn)
+        axes.fill_between(x, low, high, color=style.SKY, alpha=0.25, lw=0, label="95 % band of the whole curve", zorder=1)
+        low, high = np.quantile(drawn, [0.16, 0.84], axis=0)
         axes.fill_between(x, low, high, color=style.SKY, alpha=0.55, lw=0, label="68 % band", zorder=1)
     for one, colour, dashes, label in (
         (table, style.GREEN, (0, (1, 1.2)), "table"),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 import gonio
 from gonio.integrate import MapValues, reflectance_map
 from gonio.maps.band import _quantiles, band_of
+from gonio.maps.simultaneous import band_of_curves
 
 Array = NDArray[np.float64]
 make_brdf, make_source = gonio.brdf.make, gonio.source.make
@@ -104,3 +105,35 @@ def test_quantiles_are_those_of_numpy(draws: int) -> None:
     maps = np.einsum("dk,kij->dij", weights, np.array(parts))
     for wanted in (SIXTY_EIGHT, (0.0, 0.5, 1.0)):
         assert _quantiles(weights, parts, wanted) == pytest.approx(np.quantile(maps, wanted, axis=0), rel=1e-12, abs=1e-12)
+
+
+def test_the_whole_band_holds_the_whole_map_of_as_many_draws_as_it_says() -> None:
+    """As found by single maps of all draws; a pointwise band of 95 % holds far fewer."""
+    draws = rough(np.random.default_rng(1), 200, 0.03)
+    band = band_of(draws, (0.025, 0.975), Counted(SOURCES["beam"], 1e-4), rtol=1e-4)
+    maps = each(draws, SOURCES["beam"])
+    slack = 1e-3 * maps
+    inside, pointwise = (
+        np.mean(np.all((b[0] - slack <= maps) & (maps <= b[1] + slack), axis=(1, 2))) for b in (band.whole, band.value)
+    )
+    assert 0.94 <= inside <= 0.965
+    assert pointwise < 0.93
+
+
+def test_simultaneous_band_of_a_straight_line_is_scheffe_s() -> None:
+    """Lines 5 + a + b x of independent unit normals a and b, over angles all round: c^2 is the chi2 quantile of 2 degrees of
+    freedom (Scheffe 1953), so that the band is 5 +- 2.4477 sqrt(1 + x^2)."""
+    rng = np.random.default_rng(2)
+    x = np.tan(np.linspace(-1.55, 1.55, 61))
+    a, b = 0.01 * rng.normal(size=(2, 4000))
+    low, high = band_of_curves(5.0 + a[:, None] + b[:, None] * np.clip(x, -40, 40))
+    inside = np.abs(x) < 40
+    assert (high - 5.0)[inside] == pytest.approx(0.024477 * np.sqrt(1 + x**2)[inside], rel=0.05)
+    assert (5.0 - low)[inside] == pytest.approx(0.024477 * np.sqrt(1 + x**2)[inside], rel=0.05)
+
+
+def test_a_band_of_what_does_not_vary_is_its_value_and_none_goes_below_zero() -> None:
+    curves = np.array([[0.0, 1.0, 0.1], [0.0, 1.0, 0.001], [0.0, 1.0, 0.01]])
+    band = band_of_curves(curves)
+    assert band[:, :2] == pytest.approx(np.array([[0.0, 1.0], [0.0, 1.0]]))
+    assert band[0, 2] == 0.0 < band[1, 2]

@@ -120,10 +120,10 @@ def test_what_evaluate_refuses(lit: ReflectanceMap, from_file: ReflectanceMap) -
 def test_a_file_keeps_everything_but_the_scene(lit: ReflectanceMap, tmp_path: Path) -> None:
     full = dataclasses.replace(
         lit, band=np.stack((0.9 * lit.value, 1.1 * lit.value)), impulses=((0.1, 0.2, 3.0),), attributes={"a": "b"},
-        band_error=1e-3 * lit.value,
+        band_error=1e-3 * lit.value, band_whole=np.stack((0.8 * lit.value, 1.2 * lit.value)),
     )  # fmt: skip
     got = ReflectanceMap.load(full.save(tmp_path / "m.nc"))
-    for name in ("p", "q", "value", "error", "band", "band_error"):
+    for name in ("p", "q", "value", "error", "band", "band_error", "band_whole"):
         assert np.array_equal(getattr(got, name), getattr(full, name))
     assert (got.impulses, got.sources, got.attributes) == (full.impulses, full.sources, full.attributes)
     assert lit.sources[0] == pytest.approx((P_S, Q_S)) and lit.has_scene and not got.has_scene
