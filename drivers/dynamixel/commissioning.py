@@ -1,8 +1,8 @@
 """Bringing a servo into service: is it the right one, is it healthy, does it hold the axis's settings?
 
 What is already right is not written again. EEPROM takes a write only while torque is off, so torque goes off, for a
-moment and with a warning in the log, if and only if a setting there has to change. `torque_on` then gives it back. It
-moves nothing.
+moment and with a warning in the log, if and only if a setting there has to change that nothing else keeps. `torque_on` then
+gives it back. It moves nothing.
 
 References: ROBOTIS e-manual, XM430-W350, sections on Drive Mode, Operating Mode, PWM, Current, Velocity and Position Limit
 (emanual.robotis.com/docs/en/dxl/x/xm430-w350).
@@ -19,6 +19,8 @@ from drivers.dynamixel.settings import Settings
 from gonio.errors import DeviceError, HardwareStatusError, LimitError
 
 logger = logging.getLogger(__name__)
+
+_IN_RAM_TOO = {reg.VELOCITY_LIMIT, reg.CURRENT_LIMIT, reg.PWM_LIMIT}  # the profile, gonio's watch, Goal PWM bound the same
 
 
 def commission(bus: Bus, servo_id: int, settings: Settings) -> dict[str, object]:
@@ -130,12 +132,20 @@ def eeprom_changes(bus: Bus, servo_id: int, settings: Settings) -> dict[reg.Regi
 
 
 def write_eeprom(bus: Bus, servo_id: int, settings: Settings) -> None:
-    """Put the settings into EEPROM, with torque off for a moment if something has to change."""
+    """Put the settings into EEPROM, with torque off for a moment if something has to change.
+
+    Limits that registers in RAM keep as well are no reason to let go of an arm; they are then left, with a warning.
+    """
     changes = {register: value for register, (_, value) in eeprom_changes(bus, servo_id, settings).items()}
     if not changes:
         return
     if bus.read(servo_id, reg.TORQUE_ENABLE):
         names = ", ".join(register.name for register in changes)
+        if changes.keys() <= _IN_RAM_TOO:
+            logger.warning(
+                "%s holds with its torque on, so %s stays as it is; `gonio rig setup` writes it", bus.label(servo_id), names
+            )
+            return
         logger.warning("%s: torque off for a moment to change %s", bus.label(servo_id), names)
         bus.write(servo_id, reg.TORQUE_ENABLE, 0)
     _write_checked(bus, servo_id, changes, "power-cycle it and retry")

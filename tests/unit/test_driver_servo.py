@@ -344,6 +344,21 @@ def test_current_and_pwm_limits_are_written_and_read_back(bench: Bench) -> None:
     assert untouched.register(36, 2) == 700
 
 
+def test_a_new_speed_is_no_reason_to_let_go(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    """The arm holds; the profile bounds the speed, and EEPROM keeps its old limit until `rig setup`."""
+    rig = bench()
+    rig.connected().close()
+    rig.bus.close()
+    bus = Bus(rig.bus.port_name, clock=rig.clock, now=rig.clock.now).open()
+    try:
+        Servo(bus, "arm", 1, lower=-100 * DEG, upper=100 * DEG, velocity=30 * DEG, acceleration=300 * DEG).connect()
+    finally:
+        bus.close()
+    assert rig.writes(64) == 1  # torque on, once
+    assert (rig.register(112, 4), rig.register(44, 4)) == (21, 43)
+    assert "Velocity Limit stays as it is; `gonio rig setup` writes it" in caplog.text
+
+
 def test_a_model_without_a_current_sensor_has_a_pwm_limit(bench: Bench) -> None:
     rig = bench(model=XL430_W250)
     rig.connected(model="XL430-W250", pwm_limit=0.8)
