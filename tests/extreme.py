@@ -160,8 +160,9 @@ def fingerprint() -> str:
 
 
 def sweep(number: int) -> dict[str, Any]:
-    """One chunk: how many scenes, the processor's time for them [s], the slowest, and all faults."""
+    """One chunk: how many scenes, how many different ones, the processor's time [s], the slowest, and all faults."""
     found: list[dict[str, Any]] = []
+    different: set[str] = set()
     slowest: tuple[float, Scene] = (0.0, {})
     count, start = 0, time.process_time()
 
@@ -178,12 +179,15 @@ def sweep(number: int) -> dict[str, Any]:
         took = time.process_time() - begun
         slowest = max(slowest, (took, scene), key=lambda pair: pair[0])
         count += 1
+        different.add(repr(scene))
         if wrong:
             found.append({"fault": wrong, "scene": scene})
 
     run()
     seconds = time.process_time() - start
-    return {"chunk": number, "scenes": count, "seconds": seconds, "slowest": slowest, "faults": found}
+    return {
+        "chunk": number, "scenes": count, "different": len(different), "seconds": seconds, "slowest": slowest, "faults": found
+    }  # fmt: skip
 
 
 def sweeps(chunks: int, log: Path = LOG) -> list[dict[str, Any]]:

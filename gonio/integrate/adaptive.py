@@ -223,16 +223,21 @@ class _Block:
         if not widths:
             return
         half = np.ascontiguousarray(np.concatenate(widths, axis=1))
-        while True:
-            ways = np.empty(len(self.base), dtype=np.int64)
-            place(self.cells, self.owner, self.circles, self.base, self.box, where, half, ways)
-            if not np.any(ways):
-                return
-            self.base, self.box = _halve(self.base, self.box, ways)
-            if len(self.base) * NODES.size**2 > _LARGEST * len(self.fixed):
+        done: list[tuple[Index, Array]] = []
+        base, box, finished = self.base, self.box, 0
+        while len(base):
+            ways = np.empty(len(base), dtype=np.int64)
+            place(self.cells, self.owner, self.circles, base, box, where, half, ways)
+            ways[_smallest(box) <= _DEEPEST] = 0  # an edge that runs along a ring leaves nothing there
+            small = ways == 0
+            done.append((base[small], box[small]))
+            finished += np.count_nonzero(small)
+            base, box = _halve(base[~small], box[~small], ways[~small])
+            if (finished + len(base)) * NODES.size**2 > _LARGEST * len(self.fixed):
                 raise IntegrationError(
                     f"{self.term.model.name}: more than {_LARGEST} nodes around its lobes for one gradient"
                 )
+        self.base, self.box = (np.concatenate(of) for of in zip(*done, strict=True))
 
     def run(self, rtol: float, atol: Array) -> tuple[Array, Array]:
         """Refine to the tolerance, `atol` of shape (n,); value and error (n,)."""
@@ -247,7 +252,7 @@ class _Block:
             count = np.bincount(element, minlength=n)
             open_ = (missing > tolerance) & (spent * NODES.size**2 < _LARGEST)
             split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
-            split &= np.minimum(self.box[:, 1] - self.box[:, 0], self.box[:, 3] - self.box[:, 2]) > _DEEPEST
+            split &= _smallest(self.box) > _DEEPEST
             if not np.any(split):
                 if self.term.model.pieces:
                     total, missing = self._confirm(total)
@@ -298,6 +303,11 @@ class _Block:
         return out[0], out[1], out[2]
 
 
+def _smallest(box: Array) -> Array:
+    """The shorter side of each."""
+    return np.minimum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2])
+
+
 def edge_rounding(height: Array, half_angle: float) -> Array:
     """Relative rounding error of a cap's edges: 1 eps of an angle is eps / sine of a small cap, or of what a horizon leaves.
 
@@ -328,8 +338,8 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
         # a grazing view and the shadowing of a narrow lobe each make a layer along the horizon
         layer = max(1e-9, min(float(fixed[k, 2]), term.layer_width()))
         own.append([[0.0, 0.0, 1.0, math.pi / 2 - w] for w in layer * _GROWTH ** np.arange(20) if w < 0.3])
-        if not region.about_normal and term.model.lobe_width is not None and fixed[k, 2] < GRAZING:
-            own.append(_streak(fixed[k], max(1e-9, (term.lobe_width() or 1.0) * float(fixed[k, 2]))))
+        if term.model.lobe_width is not None and fixed[k, 2] < GRAZING:
+            own.append(_streak(fixed[k], (term.lobe_width() or 1.0) * max(1e-9, float(fixed[k, 2]))))
         if light is not None and light.planes is not None:
             own.append(light.planes[k].tolist())
         rows.append(np.array([row for group in own for row in group]).reshape(-1, 4))
