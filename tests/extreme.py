@@ -184,10 +184,8 @@ def sweep(number: int) -> dict[str, Any]:
             found.append({"fault": wrong, "scene": scene})
 
     run()
-    seconds = time.process_time() - start
-    return {
-        "chunk": number, "scenes": count, "different": len(different), "seconds": seconds, "slowest": slowest, "faults": found
-    }  # fmt: skip
+    row = {"chunk": number, "scenes": count, "different": len(different), "seconds": time.process_time() - start}
+    return {**row, "slowest": slowest, "faults": found}
 
 
 def sweeps(chunks: int, log: Path = LOG) -> list[dict[str, Any]]:

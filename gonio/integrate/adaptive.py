@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate import threads
-from gonio.integrate.cells import COLUMNS, GAUSS, KRONROD, MOST_PLANES, NODES, build, fill, place
+from gonio.integrate.cells import COLUMNS, MOST_PLANES, NODES, build, fill, place, sums
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -35,10 +35,9 @@ _BLOCK = 64  # elements that advance together
 _CHUNK = 128  # cells evaluated at once: 2 MiB
 _LARGEST = 1 << 24  # nodes for one element
 _SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of the rules
-_GROWTH = 8.0  # of panels away from the horizon
+_GROWTH = 64.0  # of panels away from the horizon; halving sees to the rest
 GRAZING = 0.05  # cosine below which a view is grazing: its lobe is a streak
 _DEEPEST = 2.0**-40  # of a base cell's side
-_RULES = np.stack((KRONROD, GAUSS), axis=1)
 
 
 class Counter(Protocol):
@@ -172,7 +171,7 @@ class _Block:
         self.term, self.fixed, self.light, self.names = term, np.ascontiguousarray(fixed), light, names
         self.reverse, self.nodes = reverse, 0
         self.width = term.lobe_width()
-        self.rounding = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0)) + edge_rounding(region.axis[:, 2], region.half_angle)
+        self.rounding = 4.0 * EPS * (1.0 + 1.0 / (self.width or 1.0)) + edge_rounding(region.axis, region.half_angle)
         n, axis = len(fixed), np.ascontiguousarray(region.axis)
         planes, counts = _planes(term, fixed, region, light)
         self.frames, self.circles = np.empty((n, 3, 3)), np.empty((n, planes.shape[1], 3))
@@ -223,7 +222,7 @@ class _Block:
         if not widths:
             return
         half = np.ascontiguousarray(np.concatenate(widths, axis=1))
-        done: list[tuple[Index, Array]] = []
+        done = [(self.base[:0], self.box[:0])]
         base, box, finished = self.base, self.box, 0
         while len(base):
             ways = np.empty(len(base), dtype=np.int64)
@@ -248,7 +247,8 @@ class _Block:
             element, err = self.owner[self.base], along + across
             total = np.bincount(element, value, minlength=n).astype(float)
             missing = np.bincount(element, err, minlength=n).astype(float)
-            tolerance = np.maximum(0.95 * rtol * np.abs(total), atol)  # rounding comes on top
+            # rounding comes on top, and what it takes away cannot be mended
+            tolerance = np.maximum(np.maximum(0.95 * rtol, 0.5 * self.rounding) * np.abs(total), atol)
             count = np.bincount(element, minlength=n)
             open_ = (missing > tolerance) & (spent * NODES.size**2 < _LARGEST)
             split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
@@ -288,19 +288,15 @@ class _Block:
             pair = (fixed, flat) if self.reverse else (flat, fixed)
             accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
             f_r = f_r.reshape(weights.shape)
-            f_r *= weights
             if self.light is not None:
                 f_r *= self.light.radiance(directions.reshape(size, -1, 3), self.names[element]).reshape(weights.shape)
-            along = (f_r.reshape(-1, side) @ _RULES).reshape(size, side, 2)  # sums over chi
-            sums = np.swapaxes((np.swapaxes(along, 1, 2).reshape(-1, side) @ _RULES).reshape(size, 2, 2), 1, 2)
-            if not np.all(np.isfinite(sums)):
-                raise ParameterError(
-                    f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
-                )
-            best = sums[:, 0, 0]
-            out[:, part] = best, _SAFETY * np.abs(best - sums[:, 1, 0]), _SAFETY * np.abs(best - sums[:, 0, 1])
+            sums(f_r, weights, out[:, part])
             self.nodes += f_r.size
-        return out[0], out[1], out[2]
+        if not np.all(np.isfinite(out)):
+            raise ParameterError(
+                f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
+            )
+        return out[0], _SAFETY * np.abs(out[0] - out[1]), _SAFETY * np.abs(out[0] - out[2])
 
 
 def _smallest(box: Array) -> Array:
@@ -308,16 +304,16 @@ def _smallest(box: Array) -> Array:
     return np.minimum(box[:, 1] - box[:, 0], box[:, 3] - box[:, 2])
 
 
-def edge_rounding(height: Array, half_angle: float) -> Array:
+def edge_rounding(axis: Array, half_angle: float) -> Array:
     """Relative rounding error of a cap's edges: 1 eps of an angle is eps / sine of a small cap, or of what a horizon leaves.
 
-    `height` is the cosine of each cap's axis from the normal, shape (n,).
+    `axis` holds the direction of each cap from the normal, shape (n, 3).
     """
-    if half_angle >= math.pi / 2:
-        return np.zeros(len(height))
+    if half_angle >= math.pi:
+        return np.zeros(len(axis))
+    left = np.abs(half_angle + 0.5 * math.pi - np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2]))
     sine = math.sin(half_angle)
-    left = np.minimum(np.abs(height + sine), sine)
-    return np.asarray(4.0 * EPS * (1.0 / np.maximum(left, EPS) + 1.0 / sine))
+    return np.asarray(4.0 * EPS * (1.0 / np.clip(left, EPS, sine) + 1.0 / sine))
 
 
 def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tuple[Array, Index]:

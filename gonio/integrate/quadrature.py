@@ -199,7 +199,7 @@ def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
 def _rounding(scene: _Scene) -> Array:
     """Relative rounding error of the sums: 1 eps of a direction is eps / width of a lobe, or of what a horizon leaves."""
     width = scene.width * np.maximum(scene.cos_n, min(scene.width, 1.0))
-    return np.asarray(4.0 * EPS * (1.0 + 1.0 / width) + edge_rounding(scene.axis[:, 2], scene.cap.half_angle))
+    return np.asarray(4.0 * EPS * (1.0 + 1.0 / width) + edge_rounding(scene.axis, scene.cap.half_angle))
 
 
 def _first_orders(scene: _Scene, rtol: float) -> NDArray[np.intp]:

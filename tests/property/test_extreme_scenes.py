@@ -62,8 +62,8 @@ def test_a_hundred_thousand_extreme_scenes() -> None:
     different, seconds = (sum(row[of] for row in done) for of in ("different", "seconds"))
     record(
         "extreme scenes",
-        f"{faults} of {scenes_run} scenes ({different} different ones, chunk by chunk) with a crash, a NaN or a silent zero; "
-        f"{seconds:.0f} s of a core",
+        f"{faults} of {scenes_run} scenes ({different} different ones within their thousands) with a crash, a NaN or a "
+        f"silent zero; {seconds:.0f} s of a core",
         "10^5 scenes without crash, NaN or silent zero",
         "0 to 99",
         "pytest -m gate tests/property/test_extreme_scenes.py -k thousand_extreme_scenes -s",
