@@ -230,7 +230,7 @@ class _Block:
             ways[_smallest(box) <= _DEEPEST] = 0  # an edge that runs along a ring leaves nothing there
             small = ways == 0
             done.append((base[small], box[small]))
-            finished += np.count_nonzero(small)
+            finished += int(np.count_nonzero(small))
             base, box = _halve(base[~small], box[~small], ways[~small])
             if (finished + len(base)) * NODES.size**2 > _LARGEST * len(self.fixed):
                 raise IntegrationError(
