@@ -79,6 +79,16 @@ def test_check_and_doctor(gonio: Verb) -> None:
     assert code in (0, 3) and "Traceback" not in err
 
 
+def test_doctor_tells_a_setting_that_differs(gonio: Verb, served: Path) -> None:
+    gonio("rig", "check", "RIG")
+    text = served.read_text()
+    limited = served.with_name("limited.toml")
+    limited.write_text(text.replace("u_zero_deg = 0.1 ", "current_limit_a = 1.0\nu_zero_deg = 0.1 ", 1))
+    code, out, _ = gonio("doctor", limited.as_posix())
+    assert code == 3 and "12.0 V; Current Limit is 1193, rig.toml means 371" in out
+    assert f"mend it: gonio rig setup {limited.as_posix()}" in out
+
+
 def test_home_move_and_park(gonio: Verb) -> None:
     assert gonio("rig", "home", "RIG")[0] == 0
     code, out, _ = gonio("rig", "move", "RIG", "arm", "-20.5", "--json")
