@@ -42,13 +42,15 @@ def lines(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     from gonio.formats.quantity import QUANTITIES
 
     out = [("quantity", found["quantity_in_file"]), ("conventions", CONVENTIONS)]
-    if found["quantity_in_file"] != QUANTITIES["brdf"]:
+    if not found["quantity_in_file"].startswith(QUANTITIES["brdf"]):
         out.insert(1, ("read as", QUANTITIES["brdf"]))
     if "samples" in found:
         low, high = found["f_r"]
         out.append(("samples", f"{found['samples']} in {_channels(found['channels'])}; f_r {low:.4g} to {high:.4g} 1/sr"))
         if len(found["channels"]) > 1:
             out.append(("shown is", f"{found['channel_shown']}; --channel of import and convert takes another one"))
+        if found["n_incident_azimuths"] > 1:
+            out.append(("grain", "f_r depends on the incident azimuth" if found["grain"] else "none seen"))
         out += [("uncertainty", _uncertainty(found)), ("coverage", _coverage(found)), ("reciprocity", _reciprocity(found))]
     else:
         over = "phi_h, theta_h, theta_d, phi_d" if found["grain"] else "theta_h, theta_d, phi_d"

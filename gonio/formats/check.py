@@ -70,6 +70,8 @@ def _mitsuba(path: Path, reader: str) -> Result:
 
 def _pywincalc(path: Path, reader: str) -> Result:
     _, matrices, side = klems.read_matrices(path)
+    if len(matrices) > 1:
+        return Result(reader, "not asked: it reads no CIE-X and CIE-Z, which this file of colours has", None)
     theirs = peers.pywincalc_matrices(path)["front" if side.endswith("front") else "back"]
     ours = matrices[len(matrices) // 2]
     if theirs.shape != ours.shape:
@@ -84,7 +86,7 @@ def _radiance(path: Path, reader: str) -> Result:
     centre = basis.centres()
     i = rng.choice(len(basis), 6).repeat(CELLS // 6)
     r = rng.choice(len(basis), CELLS)
-    theirs = peers.radiance_f_r(path, centre[i] * klems.MIRRORED, centre[r])[:, 1]
+    theirs = peers.radiance_f_r(path, centre[i] * klems.MIRRORED, centre[r]) @ peers.RADIANCE_LUMINANCE
     ours = matrices[len(matrices) // 2][r, i]
     difference = float(np.abs(theirs - ours).max() / np.abs(ours).max())
     low, mean, high = peers.radiance_reciprocity_percent(path)

@@ -37,6 +37,7 @@ PEERS = {
 SCHEMAS = Path(__file__).with_name("bird_schemas")
 SECONDS = 120
 SOURCE_DEG = 0.5  # angular diameter of the lamp in the Radiance scene
+RADIANCE_LUMINANCE = np.array([0.265074126, 0.670114631, 0.064811243])  # Y of Radiance's own primaries, src/common/color.h
 
 
 def installed() -> dict[str, bool]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import files, formats
+from gonio.brdf import grained
 from gonio.brdf.base import BRDF
 from gonio.brdf.tables import Tables
 from gonio.brdf.tabulated import tabulate
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 ALBEDO_DEG = (0.0, 30.0, 60.0)
 MOST = 20_000  # samples of which a table is made to judge the energy
 SAME = 1e-4  # directions closer than this [rad] count as one
+MOST_GRAINED = 5_000
 HEMISPHERE_BINS = 6 * 6  # of azimuth, from the incident to the mirror side, and of polar angle
 
 
@@ -38,8 +40,9 @@ def describe(path: Path, quantity: str | None = None) -> dict[str, Any]:
     form = formats.FORMATS[name]
     found = formats.read(path, quantity)
     out: dict[str, Any] = {"file": str(path), "bytes": files.size_of(path), "format": name, "format_doc": form.doc}
-    stated = quantity or form.quantity
-    out["quantity_in_file"] = quantities.QUANTITIES[stated] if stated else "as the file says: see source_quantity"
+    stated = quantity or form.quantity or found.attributes.get("source_quantity", "brdf")
+    word, space, rest = stated.partition(" ")
+    out["quantity_in_file"] = quantities.QUANTITIES.get(word, word) + space + rest
     out["quantity_read"] = quantities.QUANTITIES["brdf"]
     if isinstance(found, Tables):
         out |= {
@@ -58,7 +61,8 @@ def describe(path: Path, quantity: str | None = None) -> dict[str, Any]:
         "channel_shown": one.attributes.get("channel", channels.channels.names[0]),
         "attributes": dict(channels.attributes),
     }
-    return out | coverage_of(one) | reciprocity_of(one) | energy_of(one)
+    grain = grained.shown_by(one)
+    return out | {"grain": grain} | coverage_of(one) | reciprocity_of(one, grain) | energy_of(one, grain)
 
 
 def coverage_of(samples: BRDFSamples) -> dict[str, Any]:
@@ -85,13 +89,16 @@ def coverage_of(samples: BRDFSamples) -> dict[str, Any]:
     return out
 
 
-def reciprocity_of(samples: BRDFSamples) -> dict[str, Any]:
-    """Pairs of samples with swapped directions (turned about the normal), and how much they differ."""
+def reciprocity_of(samples: BRDFSamples, grain: bool) -> dict[str, Any]:
+    """Pairs of samples with swapped directions, without a grain also turned about the normal, and how much they differ."""
     from scipy.spatial import cKDTree
 
-    relative = samples.phi_r - samples.phi_i
-    key = np.stack((samples.theta_i, samples.theta_r, np.cos(relative)), axis=-1)
-    swapped = key[:, [1, 0, 2]]
+    if grain:
+        wi, wr = samples.omega_i(), samples.omega_r()
+        key, swapped = np.concatenate((wi, wr), axis=-1), np.concatenate((wr, wi), axis=-1)
+    else:
+        key = np.stack((samples.theta_i, samples.theta_r, np.cos(samples.phi_r - samples.phi_i)), axis=-1)
+        swapped = key[:, [1, 0, 2]]
     other = np.abs(samples.theta_i - samples.theta_r) > 10 * SAME
     if not np.any(other):
         return {"reciprocal_pairs": 0}
@@ -106,14 +113,15 @@ def reciprocity_of(samples: BRDFSamples) -> dict[str, Any]:
     return out
 
 
-def energy_of(data: BRDFSamples | Tables) -> dict[str, Any]:
+def energy_of(data: BRDFSamples | Tables, grain: bool = False) -> dict[str, Any]:
     """Directional albedo of the table, or of a table made from the samples; says why where there is none."""
     try:
         if isinstance(data, Tables):
             brdf = data.brdf()
         else:
-            take = np.random.default_rng(0).permutation(len(data))[:MOST]
-            brdf = tabulate(data.select(np.sort(take))).brdf()
+            take = np.random.default_rng(0).permutation(len(data))[: MOST_GRAINED if grain else MOST]
+            some = data.select(np.sort(take))
+            brdf = grained.tabulate(some, (16, 14, 10, 8)).brdf() if grain else tabulate(some).brdf()
         albedo = [_albedo(brdf, float(np.radians(a))) for a in ALBEDO_DEG]
     except (DatasetError, IntegrationError) as error:
         return {"energy": f"not known: {error}"}
