@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from fitting import optimum, sample, sampled
 from fitting.diagnostics import advice, contraction, entangled, misfit_limit
-from fitting.likelihood import Problem
+from fitting.likelihood import Channelled, Problem
 from gonio import brdf
+from gonio.channels import ChannelSamples
 from gonio.errors import DatasetError, ParameterError
 from gonio.posterior import Posterior
 from gonio.samples import BRDFSamples
@@ -32,7 +33,7 @@ OUTLYING = 5.0  # standard deviations
 
 
 def fit(
-    samples: BRDFSamples,
+    samples: BRDFSamples | ChannelSamples,
     model: str = "lambertian+ggx",
     *,
     free: Iterable[str] = (),
@@ -46,6 +47,7 @@ def fit(
     student: float | None = None,
     threads: int = 1,
     chain: bool = False,
+    tie: Iterable[str] = (),
     resume: Posterior | None = None,
     max_samples: int | None = MAX_SAMPLES,
     rule: sample.Rule | None = None,
@@ -54,7 +56,9 @@ def fit(
 
     Parameters
     ----------
-    samples : BRDFSamples
+    samples : BRDFSamples or ChannelSamples
+        Of several channels, parameters in which f_r is linear are one for each, ``"lambertian.albedo[red]"``, and all others
+        the same in all; see `gonio.posterior.Posterior.channel`.
     model : str
         Models joined by ``+``.
     free : iterable of str
@@ -79,6 +83,8 @@ def fit(
         For the likelihood of several walkers; the numbers do not depend on it.
     chain : bool
         Walk with emcee even where importance sampling would do.
+    tie : iterable of str
+        Linear parameters that are the same in all channels, too.
     resume : Posterior, optional
         Of the same samples and options, not converged: its chains go on, as if they had never stopped.
     max_samples : int, optional
@@ -117,13 +123,21 @@ def fit(
         raise ParameterError(f"seed = {seed} is negative; choose a whole number from 0 up")
     models = brdf.parse(model)
     first, second = (int(s.generate_state(1)[0]) for s in np.random.SeedSequence(seed).spawn(2))
+    channels, tied = None, tuple(tie)
+    if isinstance(samples, ChannelSamples):
+        parts = samples.all_channels()
+        index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        channels, samples = Channelled(samples.channels.names, index, tied), BRDFSamples.together(parts)
+    elif tied:
+        raise ParameterError(f"tie: {tied[0]!r} is one number anyway, as the samples have one channel")
     given = len(samples)
     if max_samples is not None and given > max_samples:
         chosen = np.sort(np.random.default_rng(first).choice(given, max_samples, replace=False))
         samples = samples.select(chosen)
+        channels = channels and replace(channels, index=channels.index[chosen])
     options: dict[str, Any] = {
         "free": tuple(free), "fix": dict(fix or {}), "priors": dict(priors or {}), "shared": shared, "student": student,
-        "threads": threads,
+        "threads": threads, "channels": channels,
     }  # fmt: skip
     problem = Problem(samples, models, discrepancy=bool(discrepancy), **options)
     modes = optimum.find(problem, np.random.default_rng(first))

@@ -29,15 +29,17 @@ References
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitting.parameters import Declared, Space, declare
+from fitting.parameters import Declared, Space, declare, declare_channels, of_each_channel
 from gonio import jit
 from gonio.brdf import Model, term_names
 from gonio.brdf.elementary import exp, log, log1p
@@ -191,6 +193,24 @@ def noise_parameters(samples: BRDFSamples, discrepancy: bool) -> list[Declared]:
     ]
 
 
+@dataclass(frozen=True)
+class Channelled:
+    """To which of several channels each sample belongs.
+
+    Attributes
+    ----------
+    names : tuple of str
+    index : ndarray of int, shape (n,)
+        In ascending order.
+    tie : tuple of str
+        See `fitting.parameters.declare_channels`.
+    """
+
+    names: tuple[str, ...]
+    index: NDArray[np.int64]
+    tie: tuple[str, ...] = ()
+
+
 class Problem:
     """Samples, model and priors: everything that a fit needs.
 
@@ -209,6 +229,8 @@ class Problem:
         Degrees of freedom of Student's t in place of Gauss.
     threads : int
         For log densities of several walkers.
+    channels : Channelled, optional
+        Which channel each sample belongs to, for models with some parameters of each; the samples are in order of it.
 
     Attributes
     ----------
@@ -235,6 +257,7 @@ class Problem:
         discrepancy: bool = False,
         student: float | None = None,
         threads: int = 1,
+        channels: Channelled | None = None,
     ) -> None:
         if len(samples) == 0:
             raise DatasetError("there are no samples to fit: scan or import some first")
@@ -249,10 +272,21 @@ class Problem:
         if threads < 1:
             raise ParameterError(f"threads = {threads}; choose 1 or more")
         self.samples, self.models, self.student, self.threads = samples, tuple(models), student, threads
-        own = declare(self.models)
+        self.channels = channels or Channelled(("",), np.zeros(len(samples), dtype=np.int64))
+        if channels is None:
+            own = declare(self.models)
+            self._columns = np.arange(len(own))[None, :]
+        else:
+            own, self._columns = declare_channels(self.models, channels.names, channels.tie)
         errors = shared_parameters(samples, shared)
+        declared = [*own, *errors, *noise_parameters(samples, discrepancy)]
+        fix, priors = dict(fix or {}), dict(priors or {})
+        meant = of_each_channel((*free, *fix, *priors), declared)
         self.space = Space(
-            [*own, *errors, *noise_parameters(samples, discrepancy)], free=free, fix=fix, priors=priors
+            declared,
+            free=[one for name in free for one in meant[name]],
+            fix={one: value for name, value in fix.items() for one in meant[name]},
+            priors={one: q for name, q in priors.items() for one in meant[name]},
         )
         self.model_names = tuple(name for name in self.space.names if name in {p.name for p in own})
         if not self.model_names:
@@ -281,9 +315,12 @@ class Problem:
         self._has_log = bool(np.any(s.d_ln_f))
         unknown = np.isnan(s.u_f_r)
         u2 = np.where(unknown, 0.0, np.nan_to_num(s.u_f_r)) ** 2
-        self._blocks = []
-        for a in range(0, len(s), BLOCK):
-            cut = slice(a, a + BLOCK)
+        self._blocks, self.block_channels = [], []
+        edges = np.searchsorted(self.channels.index, np.arange(len(self.channels.names) + 1))
+        cuts = [(c, a) for c, (start, end) in enumerate(itertools.pairwise(edges)) for a in range(start, end, BLOCK)]
+        for channel, a in cuts:
+            cut = slice(a, min(a + BLOCK, edges[channel + 1]))
+            self.block_channels.append(channel)
             block = (
                 np.ascontiguousarray(base[:, cut]),
                 np.ascontiguousarray(slope[:, :, cut]),
@@ -313,10 +350,15 @@ class Problem:
         _directions_kernel(base, slope, full, self._offset, self._varied, STEP, out)
         return out
 
-    def add_term(self, term: int, full: Array, directions: Array, out: Array) -> None:
-        """Add f_r of one term to `out`, shape (w, 1 + v, n); the shared errors turn directions and do nothing else."""
+    def columns(self, term: int, channel: int) -> NDArray[np.int64]:
+        """Places of a term's parameters among all declared ones."""
         _, model, first = self.terms[term]
-        parameters = np.ascontiguousarray(full[:, first : first + len(model.parameters)])
+        return self._columns[channel, first : first + len(model.parameters)]
+
+    def add_term(self, term: int, full: Array, directions: Array, out: Array, channel: int) -> None:
+        """Add f_r of one term to `out`, shape (w, 1 + v, n); the shared errors turn directions and do nothing else."""
+        model = self.terms[term][1]
+        parameters = np.ascontiguousarray(full[:, self.columns(term, channel)])
         if model.derived is not None:
             parameters = np.array([model.complete(row) for row in parameters])
         _term_kernel(model.function)(directions, parameters, out)
@@ -331,7 +373,7 @@ class Problem:
         directions = self.directions(full, index)
         values = np.zeros((len(full), *directions.shape[1::2]))
         for term in range(len(self.terms)):
-            self.add_term(term, full, directions, values)
+            self.add_term(term, full, directions, values, self.block_channels[index])
         mean, var = np.empty((len(full), u2.size)), np.empty((len(full), u2.size))
         _moments_kernel(
             values, full, self._offset, self._noise, log_slope, self._has_log, self._noisy, self._variant,

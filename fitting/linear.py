@@ -17,7 +17,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ class Coefficient:
         Among all declared parameters.
     factor : bool
         The whole term is proportional to it.
+    channels : frozenset of int
+        Numbers of the channels that it belongs to.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Coefficient:
     place: int
     column: int
     factor: bool
+    channels: frozenset[int]
 
 
 def coefficients(problem: Problem, accept: Callable[[int], bool] = lambda place: True) -> tuple[Coefficient, ...]:
@@ -63,15 +66,25 @@ def coefficients(problem: Problem, accept: Callable[[int], bool] = lambda place:
     accept : callable, optional
         Of the place of a free parameter: whether it may be one.
     """
-    found = []
-    for number, (term, model, first) in enumerate(problem.terms):
+    found: dict[int, Coefficient] = {}
+    for number, (_, model, _) in enumerate(problem.terms):
         names = [p.name for p in model.parameters]
-        for short in (*model.factors, *model.affine):
-            name = f"{term}.{short}"
-            if name in problem.space.names and accept(place := problem.space.names.index(name)):
-                found.append(Coefficient(name, number, place, first + names.index(short), short in model.factors))
-                break
-    return tuple(found)
+        for channel in range(len(problem.channels.names)):
+            columns = problem.columns(number, channel)
+            for short in (*model.factors, *model.affine):
+                column = int(columns[names.index(short)])
+                name = problem.space.declared[column].name
+                if name in problem.space.names and accept(place := problem.space.names.index(name)):
+                    one = Coefficient(name, number, place, column, short in model.factors, frozenset((channel,)))
+                    before = found.get(column, one)
+                    found[column] = replace(one, channels=before.channels | one.channels)
+                    break
+    return tuple(found.values())
+
+
+def of_block(problem: Problem, linear: tuple[Coefficient, ...], index: int) -> tuple[Coefficient, ...]:
+    """The coefficients of the channel to which a block of samples belongs."""
+    return tuple(c for c in linear if problem.block_channels[index] in c.channels)
 
 
 def bases(problem: Problem, linear: tuple[Coefficient, ...], full: Array, index: int) -> tuple[Array, Array]:
@@ -86,7 +99,10 @@ def bases(problem: Problem, linear: tuple[Coefficient, ...], full: Array, index:
     -------
     a : ndarray, shape (w, 1, n)
     b : ndarray, shape (p, w, 1, n)
+        Of those coefficients that the block's channel has, `of_block`.
     """
+    channel = problem.block_channels[index]
+    linear = of_block(problem, linear, index)
     directions = problem.directions(full, index)[:, :1]
     if not directions.flags.c_contiguous:
         directions = np.ascontiguousarray(directions)
@@ -95,21 +111,21 @@ def bases(problem: Problem, linear: tuple[Coefficient, ...], full: Array, index:
     owner = {c.term: k for k, c in enumerate(linear)}
     for term in range(len(problem.terms)):
         if term not in owner:
-            problem.add_term(term, full, directions, a)
+            problem.add_term(term, full, directions, a, channel)
             continue
         c, out = linear[owner[term]], b[owner[term]]
         full[:, c.column] = 1.0
-        problem.add_term(term, full, directions, out)
+        problem.add_term(term, full, directions, out, channel)
         if not c.factor:
             constant = np.zeros(shape)
             full[:, c.column] = 0.0
-            problem.add_term(term, full, directions, constant)
+            problem.add_term(term, full, directions, constant, channel)
             out -= constant
             a += constant
     return a, b
 
 
-def _products(a, b, full, offset, log_slope, has_log, about, reading, root, out):  # type: ignore[no-untyped-def]
+def _products(a, b, full, offset, log_slope, has_log, about, place, reading, root, out):  # type: ignore[no-untyped-def]
     """Add the weighted products of (f - a - b about, b_1, ..., b_p), factor included, to the lower half of out."""
     p, n = b.shape[0], reading.size
     rows, factor, scaled = np.empty((p + 1, n)), root.copy(), reading * root
@@ -138,7 +154,7 @@ def _products(a, b, full, offset, log_slope, has_log, about, reading, root, out)
                 other, total = rows[l], 0.0
                 for j in range(n):
                     total += one[j] * other[j]
-                out[w, k, l] += total
+                out[w, place[k], place[l]] += total
 
 
 _products_kernel = jit.kernel(_products)
@@ -169,7 +185,11 @@ def products(
         a, b = bases(problem, linear, full, index)
         log_slope, offset, has_log = problem.log_slopes(index)
         cut = slice(at, at + log_slope.shape[1])
-        _products_kernel(a, b, full, offset, log_slope, has_log, about, reading[cut], root[cut], out)
+        here = [k for k, c in enumerate(linear) if problem.block_channels[index] in c.channels]
+        place = np.array([0, *(k + 1 for k in here)], dtype=np.int64)
+        _products_kernel(
+            a, b, full, offset, log_slope, has_log, about[here], place, reading[cut], root[cut], out
+        )
         at = cut.stop
     return out
 
@@ -182,7 +202,9 @@ def columns(problem: Problem, linear: tuple[Coefficient, ...], full: Array) -> t
         log_slope, offset, _ = problem.log_slopes(index)
         factor = np.exp(full[:, offset : offset + len(log_slope)] @ log_slope)  # (w, n)
         known.append(factor * a[:, 0])
-        by.append(factor[..., None] * b[:, :, 0].transpose(1, 2, 0))
+        here = [k for k, c in enumerate(linear) if problem.block_channels[index] in c.channels]
+        by.append(np.zeros((*factor.shape, len(linear))))
+        by[-1][..., here] = factor[..., None] * b[:, :, 0].transpose(1, 2, 0)
     return np.concatenate(known, axis=1), np.concatenate(by, axis=1)
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,54 @@ def declare(models: Sequence[Model]) -> list[Declared]:
             raise ParameterError(f"{model.name} is not compiled, as a fit needs it; write it with @gonio.jit.model")
         declared += [Declared(f"{term}.{p.name}", p.lower, p.upper, p.prior, p.unit, p.fixed) for p in model.parameters]
     return declared
+
+
+def declare_channels(
+    models: Sequence[Model], channels: Sequence[str], tie: Iterable[str] = ()
+) -> tuple[list[Declared], NDArray[np.int64]]:
+    """The parameters of a sum of models that is fitted to several channels at once.
+
+    Those in which f_r is linear, such as an albedo, are one for each channel, ``"lambertian.albedo[red]"``; the others, such
+    as a roughness, are the same in all.
+
+    Parameters
+    ----------
+    models : sequence of Model
+    channels : sequence of str
+    tie : iterable of str
+        Linear parameters that are the same in all channels nevertheless.
+
+    Returns
+    -------
+    declared : list of Declared
+    columns : ndarray, shape (channels, parameters of the sum)
+        For each channel, the place of each parameter among the declared ones.
+    """
+    plain = declare(models)
+    linear = {
+        f"{term}.{short}" for term, m in zip(term_names(models), models, strict=True) for short in (*m.factors, *m.affine)
+    }
+    tied = set(tie)
+    for name in tied:
+        if name not in linear:
+            raise ParameterError(f"tie: {name!r} is no linear parameter{suggestion(name, linear)}; others are tied anyway")
+    declared: list[Declared] = []
+    columns = np.empty((len(channels), len(plain)), dtype=np.int64)
+    for i, p in enumerate(plain):
+        names = [f"{p.name}[{c}]" for c in channels] if p.name in linear - tied else [p.name]
+        columns[:, i] = len(declared) + np.arange(len(names))
+        declared += [replace(p, name=name) for name in names]
+    return declared, columns
+
+
+def of_each_channel(names: Iterable[str], declared: Iterable[Declared]) -> dict[str, tuple[str, ...]]:
+    """What a user's names mean: that of a parameter of each channel stands for all channels', others for themselves."""
+    known = [p.name for p in declared]
+    found = {}
+    for name in names:
+        several = tuple(k for k in known if k.startswith(f"{name}["))
+        found[name] = several if several and name not in known else (name,)
+    return found
 
 
 def _form(q: Prior) -> int:

@@ -135,6 +135,29 @@ class Posterior:
             terms.append(brdfs.Term(model, model.values({short: values[name] for short, name in names.items()})))
         return brdfs.BRDF(terms)
 
+    def channel(self, name: str) -> Posterior:
+        """Of one channel of a fit to several: its parameters without the channel's name, and those that all have in common.
+
+        Raises
+        ------
+        ParameterError
+            If there is no such channel; the message lists them.
+        """
+        ending = f"[{name}]"
+        known = {n[n.index("[") + 1 : -1] for n in (*self.names, *self.fixed) if n.endswith("]")}
+        if name not in known:
+            raise ParameterError(f"the posterior has no channel {name!r}; it has: {', '.join(sorted(known)) or 'one only'}")
+        kept = [i for i, n in enumerate(self.names) if n.endswith(ending) or not n.endswith("]")]
+        fixed = {n.removesuffix(ending): v for n, v in self.fixed.items() if n.endswith(ending) or not n.endswith("]")}
+        names = tuple(self.names[i].removesuffix(ending) for i in kept)
+        per = {"tau", "ess", "rhat", "contraction", "optimum", "units", "priors"}
+        diagnostics = {
+            key: {n.removesuffix(ending): v for n, v in value.items() if n.endswith(ending) or not n.endswith("]")}
+            if key in per and isinstance(value, Mapping) else value
+            for key, value in self.diagnostics.items()
+        }  # fmt: skip
+        return Posterior(self.model, names, self.draws[..., kept], self.log_probability, fixed, diagnostics)
+
     def summary(self) -> dict[str, dict[str, float]]:
         """Mean, standard deviation and quantiles of each free parameter.
 

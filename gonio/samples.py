@@ -12,8 +12,9 @@ The split into random, structured and systematic errors follows the GUM: JCGM 10
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,6 +118,17 @@ class BRDFSamples:
         """The samples of a mask or of an index array."""
         arrays = {f.name: getattr(self, f.name)[mask] for f in fields(self) if f.name not in ("shared", "attributes")}
         return replace(self, **arrays)
+
+    @classmethod
+    def together(cls, parts: Sequence[BRDFSamples]) -> BRDFSamples:
+        """The samples of several sets with the same shared errors, one after the other; attributes are the first one's."""
+        if any(part.shared != parts[0].shared for part in parts):
+            raise DatasetError("samples: sets with different shared errors cannot be put together")
+        arrays: dict[str, Any] = {
+            f.name: np.concatenate([getattr(part, f.name) for part in parts])
+            for f in fields(cls) if f.name not in ("shared", "attributes")
+        }  # fmt: skip
+        return replace(parts[0], **arrays)
 
     @classmethod
     def plain(
