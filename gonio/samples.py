@@ -154,10 +154,63 @@ class BRDFSamples:
         """
         value = np.array(f_r, dtype=float)
         n = len(value)
-        a, b, c, d = (
-            np.array(np.broadcast_to(np.asarray(x, dtype=float), (n,))) for x in (theta_i, phi_i, theta_r, phi_r)
-        )
+        a, b, c, d = (np.array(np.broadcast_to(np.asarray(x, dtype=float), (n,))) for x in (theta_i, phi_i, theta_r, phi_r))
         u = np.full(n, np.nan) if u_f_r is None else np.array(np.broadcast_to(np.asarray(u_f_r, dtype=float), (n,)))
         none = np.zeros((n, 3, 0))
         pose = np.full(n, -1, dtype=np.int64)
         return cls(a, b, c, d, value, u, pose, (), none, none, np.zeros((n, 0)), dict(attributes or {}))
+
+
+OF_A_RUN = ("drift",)  # shared errors that are other ones in each run; the others belong to the rig
+
+
+def together(runs: Sequence[BRDFSamples], u_mount: float) -> BRDFSamples:
+    """Samples of one material from several runs of one rig, between which the sample was taken off and put back.
+
+    Errors of the rig are the same unknown in all runs. What putting back changes, above all where on the sample the light
+    falls, is a relative error of each run's own, ``mount_1``, ``mount_2``, ...
+
+    Parameters
+    ----------
+    runs : sequence of BRDFSamples
+    u_mount : float
+        Relative standard uncertainty of putting back, the prior of each of these errors.
+
+    Raises
+    ------
+    DatasetError
+        If `u_mount` is not positive, or an error of the rig is not equally uncertain in all runs.
+    """
+    if not (np.isfinite(u_mount) and u_mount > 0):
+        raise DatasetError(f"u_mount = {u_mount:g}; give the relative uncertainty of putting a sample back, such as 0.005")
+    errors: dict[str, SharedError] = {}
+    place: list[dict[str, int]] = []  # of each run: its errors among all
+    for k, run in enumerate(runs, 1):
+        own = {}
+        for error in run.shared:
+            name = f"{error.name}_{k}" if error.name in OF_A_RUN else error.name
+            known = errors.setdefault(name, replace(error, name=name))
+            if known != replace(error, name=name):
+                raise DatasetError(
+                    f"{error.name} has an uncertainty of {error.u:g} {error.unit} in run {k} and of {known.u:g} in one "
+                    "before; runs of one rig and calibration fit together"
+                )
+            own[error.name] = list(errors).index(name)
+        errors[f"mount_{k}"] = SharedError(f"mount_{k}", u_mount)
+        own["mount"] = len(errors) - 1
+        place.append(own)
+    wide = []
+    for run, own in zip(runs, place, strict=True):
+        n, total = len(run), len(errors)
+        d_i, d_r, d_f = np.zeros((n, 3, total)), np.zeros((n, 3, total)), np.zeros((n, total))
+        for j, error in enumerate(run.shared):
+            at = own[error.name]
+            d_i[:, :, at], d_r[:, :, at], d_f[:, at] = run.d_omega_i[:, :, j], run.d_omega_r[:, :, j], run.d_ln_f[:, j]
+        d_f[:, own["mount"]] = 1.0
+        wide.append(replace(run, shared=tuple(errors.values()), d_omega_i=d_i, d_omega_r=d_r, d_ln_f=d_f))
+    arrays = {
+        f.name: np.concatenate([getattr(run, f.name) for run in wide])
+        for f in fields(BRDFSamples)
+        if f.name not in ("shared", "attributes")
+    }
+    return replace(wide[0], **arrays, attributes=runs[0].attributes)

@@ -53,6 +53,21 @@ def table(run: Path, fill: bool, channel: str | None, as_json: bool) -> None:
 @click.option("--chain", is_flag=True, help="Walk with emcee even where importance sampling would do.")
 @click.option("--max-steps", type=int, help="Longest chain.")
 @click.option("--resume", is_flag=True, help="Go on with the chains of posterior.nc; the other options as then.")
+@click.option(
+    "--with",
+    "others",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="RUN",
+    help="Another run of the same sample on the same rig, fitted together with this one; may be repeated.",
+)
+@click.option(
+    "--mount",
+    type=float,
+    default=0.005,
+    show_default=True,
+    help="Relative uncertainty of putting a sample back, for --with.",
+)
 @click.option("--threads", type=int, default=1, help="For the likelihood; the numbers do not depend on it.")
 @json_option
 def fit(
@@ -66,6 +81,8 @@ def fit(
     chain: bool,
     max_steps: int | None,
     resume: bool,
+    others: tuple[Path, ...],
+    mount: float,
     threads: int,
     as_json: bool,
 ) -> None:
@@ -77,7 +94,7 @@ def fit(
     with speaking(as_json) as output, steps.open_run(run) as opened:
         if resume:
             options["resume"] = steps.load_posterior(opened)
-        posterior = steps.fit(opened, output, model, seed, **options)
+        posterior = steps.fit(opened, output, model, seed, others=others, u_mount=mount, **options)
         steps.show_fit(output, posterior)
         if not posterior.diagnostics.get("converged"):
             output.finish()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,15 +98,36 @@ def load_posterior(run: Run) -> Posterior:
     return Posterior.load(run.posterior_path)
 
 
-def fit(run: Run, output: Output, model: str, seed: int, **options: Any) -> Posterior:
-    """Samples to a posterior, written as posterior.nc; angles among the options as a user writes them, in degrees."""
+def remounts(run: Run, others: Sequence[Path | str], u_mount: float) -> BRDFSamples:
+    """Samples of a run, together with those of others of the same sample, if any."""
+    from gonio.samples import together
+
+    if not others:
+        return run.read_samples()
+    parts = [run.read_samples()]
+    for path in others:
+        with open_run(Path(path)) as other:
+            parts.append(other.read_samples())
+    return together(parts, u_mount)
+
+
+def fit(
+    run: Run, output: Output, model: str, seed: int, *, others: Sequence[Path] = (), u_mount: float = 0.0, **options: Any
+) -> Posterior:
+    """Samples to a posterior, written as posterior.nc; angles among the options as a user writes them, in degrees.
+
+    `others` are runs of the same sample after remounting, each with a relative error of its own of sd `u_mount`.
+    """
     from fitting import fit as run_fit
     from gonio.cli.units import angles_of_fit, fit_options
 
-    samples = run.read_samples()
+    samples = remounts(run, others, u_mount)
     options = fit_options(options, angles_of_fit(model, samples))
     with output.stage("fit") as progress:
         posterior = run_fit(samples, model, seed=seed, progress=progress, **options)
+        if others:
+            runs = {"other_runs": [str(path.resolve()) for path in others], "u_mount": u_mount}
+            posterior = replace(posterior, diagnostics={**posterior.diagnostics, **runs})
         posterior.save(run.posterior_path)
     status = posterior.diagnostics
     log.info("fit %s: %s", model, {k: v for k, v in status.items() if isinstance(v, str | bool | int | float)})
@@ -298,14 +320,15 @@ def report(
 
     if maps is None:
         maps = {file.stem: ReflectanceMap.load(file) for file in sorted(run.path.glob("map*.nc"))}
+    posterior = load_posterior(run) if run.posterior_path.exists() else None
     with output.stage("report") as progress:
         attributes = {k: v for k, v in run.attributes.items() if k not in ("kind",)}
         path = reporting.build(
             run.path,
             title=f"gonio report: {run.path.name}",
-            samples=run.read_samples() if run.has_samples() else None,
+            samples=_fitted_samples(run, posterior) if run.has_samples() else None,
             table=load_table(run) if run.table_path.exists() else None,
-            posterior=load_posterior(run) if run.posterior_path.exists() else None,
+            posterior=posterior,
             maps=maps,
             truth=truth,
             attributes=attributes,
@@ -316,3 +339,9 @@ def report(
     output.say(f"wrote {path}")
     output.result(report=path)
     return path
+
+
+def _fitted_samples(run: Run, posterior: Posterior | None) -> BRDFSamples:
+    """What the posterior was fitted to: the run's samples, with those of other runs if they were fitted together."""
+    given = {} if posterior is None else posterior.diagnostics
+    return remounts(run, given.get("other_runs", ()), given.get("u_mount", 0.0))
