@@ -208,7 +208,7 @@ def together(runs: Sequence[BRDFSamples], u_mount: float) -> BRDFSamples:
             d_i[:, :, at], d_r[:, :, at], d_f[:, at] = run.d_omega_i[:, :, j], run.d_omega_r[:, :, j], run.d_ln_f[:, j]
         d_f[:, own["mount"]] = 1.0
         wide.append(replace(run, shared=tuple(errors.values()), d_omega_i=d_i, d_omega_r=d_r, d_ln_f=d_f))
-    arrays = {
+    arrays: dict[str, Any] = {
         f.name: np.concatenate([getattr(run, f.name) for run in wide])
         for f in fields(BRDFSamples)
         if f.name not in ("shared", "attributes")
