@@ -22,9 +22,12 @@ from pathlib import Path
 import numpy as np
 
 from gonio import formats
+from gonio.brdf import grained
+from gonio.brdf.tables import Tables
+from gonio.channels import RGB
 from gonio.errors import DatasetError
 from gonio.formats import merl
-from tests import gates, malformed
+from tests import gates, malformed, materials
 
 MINUTES = float(os.environ.get("GONIO_FUZZ_MINUTES", "10"))
 SLOW_S = 2.0
@@ -95,6 +98,10 @@ def corpus_of(name: str, folder: Path) -> list[bytes]:
     bad = [edit(good) for other, edit, _ in malformed.BAD if other == name]
     if name == "merl":  # has one size; the malformed ones are heads of it
         good = merl.HEADER + np.linspace(0.0, 100.0, 3 * merl.CELLS).astype("<f8").tobytes()
+    if name == "netcdf":
+        table = grained.from_brdf(materials.paint(), (4, 4, 4, 4))
+        Tables((table, table, table), RGB).save(folder / "table.nc")
+        bad.append((folder / "table.nc").read_bytes())
     return [good, *(data for data in bad if len(data) < 3_000_000)]
 
 

@@ -195,25 +195,34 @@ def _tables(path: Path, file: Contents) -> Tables:
         channels = _channels(path, file)
         if len(channels) != value.shape[0]:
             raise DatasetError(f"{path}: {len(channels)} channels are named, brdf_table has {value.shape[0]}; it is damaged")
-    else:
+    elif value.ndim == len(axes):
         value, u, coverage = value[None], u[None], coverage[None]
+    else:
+        raise DatasetError(
+            f"{path}: brdf_table has {value.ndim} dimensions, a table over {len(axes)} angles has {len(axes)}, and one more "
+            "for channels; the file is damaged"
+        )
     if u.shape != value.shape or coverage.shape != value.shape:
         raise DatasetError(f"{path}: brdf_table, its standard error and its coverage have different shapes; it is damaged")
-    kind.check_shape(value.shape[1:])
     try:
         scale = float(file.attributes["brdf_table"].get("theta_h_scale", "nan"))
     except ValueError:
         scale = math.nan
-    for name, expected in zip(axes, kind.nodes(value.shape[1:], scale), strict=True):
-        axis = _array(path, file, name)
-        if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
-            raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
     attributes = _attributes(path, file, "brdf_table")
     if np.any((coverage < 0) | (coverage > 255)):
         raise DatasetError(f"{path}: a coverage flag is outside 0 to 255; the file is damaged")
     table = grained.GrainedTable if kind is grained else tabulated.TabulatedBRDF
-    flags = coverage.astype(np.uint8)
-    return Tables(tuple(table(*part, attributes, scale) for part in zip(value, u, flags, strict=True)), channels)
+    try:
+        nodes = kind.nodes(value.shape[1:], scale)
+        parts = zip(value, u, coverage.astype(np.uint8), strict=True)
+        found = Tables(tuple(table(*part, attributes, scale) for part in parts), channels)
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}") from None
+    for name, expected in zip(axes, nodes, strict=True):
+        axis = _array(path, file, name)
+        if axis.shape != expected.shape or not np.allclose(axis, expected, rtol=0, atol=1e-9):
+            raise DatasetError(f"{path}: the nodes of {name} are not those of a gonio table; tabulate the samples again")
+    return found
 
 
 def _named(tables: object) -> TypeGuard[Tables]:

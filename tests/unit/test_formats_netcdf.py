@@ -201,6 +201,41 @@ def test_files_that_cannot_be_trusted(tmp_path: Path, table: TabulatedBRDF) -> N
             _ = netcdf.read_samples(path) if kind == "samples" else netcdf.read_tables(path)
 
 
+def test_tables_that_cannot_be_trusted(tmp_path: Path) -> None:
+    path = tmp_path / "a.nc"
+    brdf = gonio.brdf.make("lambertian", albedo=0.4)
+    before = Tables((grained.from_brdf(brdf, (6, 8, 7, 5)),) * 2, spectral([450.0, 555.5]))
+
+    def without(name: str) -> object:
+        return lambda file: file.__delitem__(name)
+
+    def set_to(name: str, value: object) -> object:
+        def edit(file: h5py.File) -> None:
+            del file[name]
+            file[name] = value
+
+        return edit
+
+    for edit, message in (
+        (set_to("brdf_table_coverage", np.full((2, 6, 8, 7, 5), 300, dtype="i4")), "outside 0 to 255"),
+        (set_to("wavelength", np.array([450.0])), "1 channels are named, brdf_table has 2"),
+        (set_to("wavelength", np.array([450.0, 450.0])), "stands twice"),
+        (without("phi_h"), "5 dimensions, a table over 3 angles"),
+        (set_to("phi_h", np.zeros(6)), "the nodes of phi_h are not those of a gonio table"),
+        (set_to("brdf_table_coverage", np.zeros((2, 6, 8, 7, 4), dtype="u1")), "have different shapes"),
+        (set_to("brdf_table_coverage", np.full((2, 6, 8, 7, 5), 9, dtype="u1")), "coverage 9 is unknown"),
+        (set_to("brdf_table_standard_error", np.full((2, 6, 8, 7, 5), -1.0)), "an uncertainty is negative"),
+        (set_to("brdf_table", np.zeros((2, 5, 8, 7, 5))), "have different shapes"),
+        (lambda file: file["brdf_table"].attrs.__setitem__("theta_h_scale", "1e9"), "have the scale 1e[+]09"),
+        (lambda file: file["brdf_table"].attrs.__delitem__("theta_h_scale"), "have the scale nan"),
+    ):
+        before.save(path)
+        change(path, edit)
+        with pytest.raises(DatasetError, match=message) as caught:
+            netcdf.read_tables(path)
+        assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
 def test_what_is_not_there(tmp_path: Path, table: TabulatedBRDF) -> None:
     with pytest.raises(DatasetError, match="neither a table nor a set of samples"):
         formats.export("netcdf", tmp_path / "a.nc")
