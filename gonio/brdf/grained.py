@@ -4,7 +4,7 @@ Nodes: even steps of phi_h (a full turn) and of phi_d (half a turn: the other ha
 `gonio.brdf.tabulated`. Cubic in the fourth root of f_r along all four; reciprocal and never negative by construction. A
 look-up costs two arc tangents, as no algebraic coordinate is periodic and even.
 
-Scattered samples become nodes by the same local regression as without a grain (`gonio.brdf.scattered`), with coordinates
+Scattered samples become nodes by the same local regression as without a grain (`gonio.brdf.regression`), with coordinates
 that are smooth where azimuths have no meaning:
 
 .. math:: (h_x, h_y)\,\frac{g(t)}{t},\quad x_2(\theta_d),\quad e_x^2 - e_y^2,\quad 2 e_x e_y,
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf import scattered, tabulated
+from gonio.brdf import regression, scattered, tabulated
 from gonio.brdf.base import BRDF, Model, Term
 from gonio.brdf.packed import BUCKETS, CELL, LARGE, SMALL, buckets, cells, cubic, weights
 from gonio.brdf.tabulated import tangents
@@ -206,14 +206,14 @@ def from_brdf(brdf: BRDF, shape: tuple[int, int, int, int] = SHAPE) -> GrainedTa
     return GrainedTable(brdf.evaluate(omega_i, omega_r), np.zeros(shape), coverage, attributes, scale)
 
 
-class _Grained(scattered.Data):
+class _Grained(regression.Data):
     """Samples in coordinates of all four angles."""
 
     def tangent(self) -> Array:
         """tan(theta_h/2) of the samples, shape (n,)."""
         return np.hypot(self.x[:, 0], self.x[:, 1])
 
-    def metric(self, x: Array, settings: scattered.Settings) -> Array:
+    def metric(self, x: Array, settings: regression.Settings) -> Array:
         """Rows t cos(phi_h), t sin(phi_h), x_2, e_x^2 - e_y^2, 2 e_x e_y under the settings."""
         t2 = x[:, 0] ** 2 + x[:, 1] ** 2
         g = np.sqrt(np.log1p(t2 / settings.c**2) / np.log1p(1.0 / settings.c**2))
@@ -241,9 +241,9 @@ def shown_by(samples: BRDFSamples) -> bool:
     some = samples.select(np.random.default_rng(0).permutation(len(samples.f_r))[: scattered.MANY])
     u, known = scattered.working_uncertainty(some.f_r, some.u_f_r)
     omega_i, omega_r = some.omega_i(), some.omega_r()
-    isotropic = scattered.Data(scattered.coordinates(omega_i, omega_r), some.f_r, u, known)
+    isotropic = regression.Data(scattered.coordinates(omega_i, omega_r), some.f_r, u, known)
     grained = _Grained(coordinates(omega_i, omega_r), some.f_r, u, known)
-    errors = [scattered.left_out_error(data, scattered.choose(data)[0]) for data in (isotropic, grained)]
+    errors = [regression.left_out_error(data, regression.choose(data)[0]) for data in (isotropic, grained)]
     return errors[1] < 0.25 * errors[0]  # squares
 
 
@@ -274,14 +274,14 @@ def tabulate(
     tell(0)
     u, known = scattered.working_uncertainty(f, samples.u_f_r)
     data = _Grained(coordinates(samples.omega_i(), samples.omega_r()), f, u, known)
-    settings, errors = scattered.choose(data)
+    settings, errors = regression.choose(data)
     tell(1)
     spread = scale or float(np.clip(0.5 * settings.c, tabulated.LEAST_SCALE, tabulated.SCALE))
     omega_i, omega_r, below = node_directions(shape, spread)
     targets = coordinates(omega_i.reshape(-1, 3), omega_r.reshape(-1, 3))
     measured = np.zeros(shape, dtype=bool)
     measured[_nearest_nodes(samples.omega_i(), samples.omega_r(), shape, spread)] = True
-    found = scattered.at_nodes(data, settings, errors, targets, measured.ravel(), lambda done: tell(1 + done))
+    found = regression.at_nodes(data, settings, errors, targets, measured.ravel(), lambda done: tell(1 + done))
     eta, sigma, far = (x.reshape(shape) for x in found)
     value, relative = np.exp(eta), np.sqrt(np.expm1(np.minimum(sigma, 2.0) ** 2))
     coverage = np.where(far, tabulated.EXTRAPOLATED, tabulated.INTERPOLATED).astype(np.uint8)

@@ -1,7 +1,7 @@
 """The tables of a data set: one for each channel, on the same nodes, all with a grain or all without.
 
 It decides from the samples whether there is a grain, and knows the file; how a table is made and evaluated is in
-`gonio.brdf.tabulated`, `gonio.brdf.grained` and `gonio.brdf.scattered`.
+`gonio.brdf.tabulated`, `gonio.brdf.grained`, `gonio.brdf.scattered` and `gonio.brdf.regression`.
 """
 
 from __future__ import annotations
