@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 FREEDOM = 5.0  # of Student's t
 _WIDE, _WIDE_SHARE = 3.0, 0.05
 _PILOT, _ROUNDS = 1000, 7
+_COPIES = 2  # draws that are kept for each that they are worth: drawing again then costs a third, not a half
 _POOR = 0.25  # share of draws that count below which another proposal is fitted
 _FITTED, _STEPS = 1000, 12  # draws and steps of a fit
 _EACH = 10.0  # effective draws for each coordinate of a component
@@ -147,7 +148,7 @@ def run(target: Target, modes: Sequence[Mode], *, seed: int, effective: int = 40
         smoothed, k_hat = psis.smooth(log_weights)
         worth = float(psis.effective(smoothed)) if np.isfinite(log_weights).any() else 0.0
         if k_hat <= psis.GOOD and worth >= effective:
-            return _collected(parts, smoothed, effective // batches, float(k_hat), worth, used, rng)
+            return _collected(parts, smoothed, _COPIES * effective // batches, float(k_hat), worth, used, rng)
         if worth == 0.0:
             return None
         share = worth / (each * batches)

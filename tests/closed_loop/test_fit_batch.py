@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
 import shutil
@@ -88,6 +89,16 @@ def test_channels_of_a_file_are_pixels(tmp_path):
     assert mean[:, 0] == pytest.approx([0.1, 0.4, 0.8], rel=1e-3)
 
 
+@contextlib.contextmanager
+def two_workers(distributed):
+    """A cluster of two processes, which may take its time to close on a busy machine."""
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=60)
+    try:
+        yield cluster
+    finally:
+        cluster.close(timeout=300)
+
+
 @pytest.mark.filterwarnings("ignore")  # of Dask, about a worker that died
 def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
@@ -97,7 +108,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(tmp_path, monkeypat
     from gonio.cli import cubes
 
     written, killed = cubes.ZarrSink.write, []
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=60) as cluster:
+    with two_workers(distributed) as cluster:
 
         def write(self, start, stop, estimates):
             if not killed:
@@ -150,7 +161,7 @@ def test_100_000_pixels_on_two_cores_and_on_a_cluster_whose_worker_dies_half_way
     from gonio.cli import cubes
 
     written, count = cubes.ZarrSink.write, []
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=60) as cluster:
+    with two_workers(distributed) as cluster:
 
         def write(self, start, stop, estimates):
             count.append(start)

@@ -29,6 +29,7 @@ def test_the_model_that_made_the_data_wins_and_the_other_one_is_inadequate(right
     best, other = found.scores
     assert best.model == f"lambertian+{right}"
     gap, error = found.difference(other, "loo")
+    print(f"{other.model}: behind by {gap:.0f} +- {error:.0f}, chi2/N = {other.chi2_per_n:.2f}, not {best.chi2_per_n:.2f}")
     assert gap > 10 * error > 0
     gap, error = found.difference(other, "incidence")
     assert gap > 4 * error
