@@ -182,7 +182,7 @@ def describe_convergence(posterior: Posterior) -> str:
     )
     advice = d.get("advice")
     if advice:
-        text += ". " + (advice if isinstance(advice, str) else " ".join(advice))
+        text += ". " + (advice if isinstance(advice, str) else ". ".join(advice))
     return text
 
 
