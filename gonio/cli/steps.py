@@ -197,7 +197,10 @@ def scene_brdf(scene: SceneConfig, folder: Path) -> tuple[BRDF, Posterior | None
         path = folder / path
     with open_run(path) as run:
         if config.use == "table":
-            return load_table(run).brdf(), None, {"brdf": f"table of {path}"}
+            tables = load_table(run)
+            n = len(tables.channels)
+            which = f", channel {tables.channels.names[tables.channels.main]} of {n}" if n > 1 else ""
+            return tables.brdf(), None, {"brdf": f"table of {path}{which}"}
         posterior = load_posterior(run)
     return posterior.brdf(), posterior, {"brdf": f"fit of {path}: {posterior.brdf()!r}"}
 
