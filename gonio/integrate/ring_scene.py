@@ -22,6 +22,7 @@ MOST_DIGITS = 14.0
 NONE = 1e9  # [rad], a width that means: no such feature
 FIRST_WAVES = 48
 _AT_LAYERS = 2.0  # digits more
+_ON_PIECES = 2.0  # times as many nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +55,16 @@ class Scene:
         corner = self._corner(digits)
         edges, detail = (self.rings.breaks, np.zeros(1)) if self.rows else self.rings.groups
 
-        # a layer finer than the lobe has no nearest pole for the orders to count with
+        # a layer finer than the lobe has no nearest pole for the orders to count with, borders of pieces have none at all
         more = _AT_LAYERS if self.term.model.layer_width is not None else 0.0
+        dense = _ON_PIECES if self.term.model.pieces else 1.0
 
         def work(tile: slice) -> int:
             effort = np.zeros(1, dtype=np.int64)
             kernel(
                 slopes[tile], self.term.values, self.term.weight, self.width, layers[tile], peaks[tile], planes[tile],
                 corner, edges, detail, self.rings.breaks, self.rings.series, *needed, self.rings.error, self.rows,
-                (digits + more) * math.log(10.0), x, w, out[tile], effort,
+                dense * (digits + more) * math.log(10.0), x, w, out[tile], effort,
             )  # fmt: skip
             return int(effort[0])
 

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import gonio
+from gonio.brdf.tabulated import from_brdf
 from gonio.geometry import gradient_from_normal, unit_vector
 from gonio.integrate import scene_radiance
 from gonio.integrate.plan import Method
@@ -175,3 +176,13 @@ def test_pixels_far_darker_than_the_brightest_against_independent_values(term: d
     off = np.abs(got.value[rows] - truth) - 2e-10 * truth
     assert np.all(off <= got.error[rows]) and np.all(off <= 1e-6 * truth)
     assert np.all(got.error <= 1.0001e-6 * got.value + 1e-30)
+
+
+def test_a_table_under_a_field() -> None:
+    """A table has borders at which no derivative but the first is continuous: sums converge slowly there."""
+    table = from_brdf(brdf(0.2)).brdf()
+    grid = gonio.reflectance_map(table, SOURCES["harmonics"], AXIS[None, 8:25], AXIS[8:25, None], rtol=1e-5)
+    cells = scene_radiance(table, SOURCES["harmonics"], np.arctan(AXIS[20]), np.array([0.0, np.pi]), rtol=3e-5)
+    off = np.abs(grid.value[8, [4, 12]] - cells.value)  # q = 0, p = -0.75 and 0.75
+    assert np.all(off <= grid.error[8, [4, 12]] + cells.error)
+    assert np.all(off <= 4e-5 * cells.value)
