@@ -162,16 +162,18 @@ def _figures(
         held = {} if posterior is None else posterior.fixed  # a truth need not repeat what the fit holds
         known = content.brdf_from({n: v for n, v in held.items() if n.rpartition(".")[0] in terms} | dict(truth))
         band: list[BRDF] = []
+        scatter: Any = None
         if posterior is not None:
             draws = posterior.thin(_BAND_DRAWS, np.random.default_rng(0))
             band = [posterior.brdf(row) for row in draws]
+            scatter = _scatter(posterior, draws)
         fit: Any = model
         measured = samples
         jobs.append((
             "slices",
             "BRDF in the plane of incidence, one panel for each angle of incidence; theta_r is positive on the mirror side, "
             "and the dotted line is the mirror direction. Bars are random standard uncertainties (k = 1).",
-            lambda: brdf_slices(measured, fit, band=band, truth=known, table=table),
+            lambda: brdf_slices(measured, fit, band=band, scatter=scatter, truth=known, table=table),
         ))  # fmt: skip
         if posterior is not None and fit is not None:
             # without the discrepancy of the model: the picture is to show where the model fails
@@ -208,3 +210,13 @@ def _figures(
 
 def _map_job(one: ReflectanceMap, name: str) -> Callable[[], Figure]:
     return lambda: map_contours(one, title=name)
+
+
+def _scatter(posterior: Posterior, draws: Any) -> Any:
+    """Relative and absolute noise of a reading that each draw has inferred, shape (draws, 2); None if none was."""
+    column = {name: draws[:, i] for i, name in enumerate(posterior.names) if name.startswith("noise.")}
+    if not column.keys() & {"noise.relative", "noise.absolute", "noise.discrepancy"}:
+        return None
+    none = np.zeros(len(draws))
+    relative = np.hypot(column.get("noise.relative", none), column.get("noise.discrepancy", none))
+    return np.column_stack((relative, column.get("noise.absolute", none)))

@@ -36,6 +36,7 @@ def brdf_slices(
     brdf: BRDF | None = None,
     *,
     band: Sequence[BRDF] = (),
+    scatter: Array | None = None,
     truth: BRDF | None = None,
     table: BRDF | None = None,
     count: int = 6,
@@ -50,6 +51,8 @@ def brdf_slices(
     band : sequence of BRDF, optional
         Draws of the posterior; the central 68 % at each angle are shaded, and lighter the band that holds 95 % of the curves
         as a whole.
+    scatter : ndarray, shape (len(band), 2), optional
+        Inferred noise of a reading under each draw, relative [1] and absolute [1/sr]: the band of 95 % of readings is drawn.
     truth, table : BRDF, optional
         The BRDF that the samples came from, where it is known, and the tabulated one.
     count : int, optional
@@ -74,7 +77,7 @@ def brdf_slices(
         for axes, centre in zip(panels.flat, centres, strict=False):
             chosen = np.flatnonzero(near & (np.abs(samples.theta_i - centre) <= np.radians(1.5)))
             chosen = chosen[:: 1 + len(chosen) // 500]
-            _slice(axes, samples.select(chosen), signed[chosen], offset[chosen], centre, brdf, band, truth, table)
+            _slice(axes, samples.select(chosen), signed[chosen], offset[chosen], centre, brdf, band, scatter, truth, table)
         for axes in panels.flat[len(centres) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
@@ -250,9 +253,30 @@ def coverage(samples: BRDFSamples) -> Figure:
     return figure
 
 
+def readings_band(curves: Array, scatter: Array) -> Array:
+    """Interval that holds 95 % of readings at each point, of the curve's uncertainty and the noise together.
+
+    Parameters
+    ----------
+    curves : ndarray, shape (draws, n)
+    scatter : ndarray, shape (draws, 2)
+        Standard deviation of the noise, relative to the curve and absolute.
+
+    Returns
+    -------
+    ndarray, shape (2, n)
+    """
+    from scipy.special import ndtri
+
+    z = ndtri((np.arange(61) + 0.5) / 61)  # (61,), at the places that Hazen's quantiles take for them
+    sd = np.hypot(scatter[:, :1] * curves, scatter[:, 1:])  # (draws, n)
+    readings = curves[:, None] + z[:, None] * sd[:, None]
+    return np.asarray(np.quantile(readings.reshape(-1, curves.shape[1]), [0.025, 0.975], axis=0, method="hazen"))
+
+
 def _slice(
     axes: Axes, samples: BRDFSamples, signed: Array, offset: Array, theta_i: float, brdf: BRDF | None,
-    band: Sequence[BRDF], truth: BRDF | None, table: BRDF | None,
+    band: Sequence[BRDF], scatter: Array | None, truth: BRDF | None, table: BRDF | None,
 ) -> None:  # fmt: skip
     x = np.degrees(_SIGNED)
     curves: list[Array] = []
@@ -264,6 +288,10 @@ def _slice(
 
     if band:
         drawn = np.array([along(one) for one in band])
+        if scatter is not None:
+            low, high = readings_band(drawn, scatter)
+            label = "95 % of readings, by inferred noise"
+            axes.fill_between(x, low, high, color=style.GREY, alpha=0.18, lw=0, label=label, zorder=0.5)
         low, high = band_of_curves(drawn)
         axes.fill_between(x, low, high, color=style.SKY, alpha=0.25, lw=0, label="95 % band of the whole curve", zorder=1)
         low, high = np.quantile(drawn, [0.16, 0.84], axis=0)

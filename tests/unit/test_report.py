@@ -403,3 +403,14 @@ def test_interrupted_write_leaves_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         html.write_bytes(target, "not bytes")  # type: ignore[arg-type]
     assert target.read_bytes() == b"old" and [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_the_band_of_readings_is_that_of_curve_and_noise_together():
+    """One known curve with 10 % and 0.05 1/sr of noise: a normal distribution; curves of sd 0.3: the sum of variances."""
+    low, high = slices.readings_band(np.array([[1.0, 2.0]]), np.array([[0.1, 0.05]]))
+    sd = np.hypot(0.1 * np.array([1.0, 2.0]), 0.05)
+    assert high - [1.0, 2.0] == pytest.approx(1.96 * sd, rel=0.03)
+    assert [1.0, 2.0] - low == pytest.approx(1.96 * sd, rel=0.03)
+    curves = np.random.default_rng(1).normal(5.0, 0.3, (4000, 1))
+    low, high = slices.readings_band(curves, np.tile([0.0, 0.4], (4000, 1)))
+    assert high - low == pytest.approx(2 * 1.96 * np.hypot(0.3, 0.4), rel=0.04)
