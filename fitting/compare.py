@@ -47,6 +47,8 @@ from gonio.samples import BRDFSamples
 Array = NDArray[np.float64]
 FOLDS = 10
 DECISIVE, LIKELY = 4.0, 2.0  # standard errors
+SMALL = 4.0  # difference of log scores that means nothing, whatever its error [2]_
+FEW = 20  # readings
 MORE_NOISE = 1.5
 ALIKE = 0.3  # correlation of neighbouring residuals above which the misfit is the model's
 _DRAWS = 2048  # of a fit
@@ -133,7 +135,7 @@ class Comparison:
         if score.alike > max(ALIKE, 4.0 / math.sqrt(n)):
             found.append(f"{100 * score.alike:.0f} % of the misfit is systematic")
         gap, error = self.difference(score, self.kind)
-        if math.isnan(score.chi2_per_n) and score.noise > MORE_NOISE * best.noise and gap > LIKELY * error:
+        if math.isnan(score.chi2_per_n) and score.noise > MORE_NOISE * best.noise and gap > max(SMALL, LIKELY * error):
             found.append(f"off by {100 * score.noise:.2g} % where {best.model} is by {100 * best.noise:.2g} %")
         return tuple(found)
 
@@ -148,14 +150,16 @@ class Comparison:
         said = []
         if len(self.scores) > 1:
             gap, error = self.difference(self.scores[1], self.kind)
-            sure = "beyond doubt" if gap > DECISIVE * error else "probably" if gap > LIKELY * error else "but not surely"
+            sure = "but not surely"
+            if gap > SMALL and len(self.group) >= FEW:
+                sure = "beyond doubt" if gap > DECISIVE * error else "probably" if gap > LIKELY * error else sure
             name = "left-out incidences" if self.kind == "incidence" else "left-out readings"
             said.append(
                 f"{best.model} predicts {name} best, {sure}: {self.scores[1].model} is {gap:.0f} +- {error:.0f} behind"
             )
             nearest = max(self.scores, key=lambda s: float(np.sum(s.loo)))
             gap, error = self.difference(best, "loo", nearest)
-            if gap > LIKELY * error:
+            if gap > max(SMALL, LIKELY * error):
                 said.append(
                     f"between neighbouring directions {nearest.model} is better, by {gap:.0f} +- {error:.0f}: it describes "
                     "what was measured and extrapolates worse"
@@ -168,6 +172,8 @@ class Comparison:
             said.append(
                 f"{'not' if good else 'no model is'} adequate: {bad}{'' if good else '; use the table, or another model'}"
             )
+        if len(self.group) < FEW:
+            said.append(f"{len(self.group)} readings are few: what describes them may be wrong elsewhere")
         if math.isnan(best.chi2_per_n):
             said.append(
                 "the samples state no uncertainty: adequate means that the residuals look like noise, not that noise of "

@@ -140,3 +140,11 @@ def test_a_model_that_needs_more_noise_than_a_better_one_is_not_adequate():
     assert found.scores[0].noise == pytest.approx(0.02, abs=0.006)
     assert found.scores[1].noise > 0.05
     assert any("where oren_nayar is by" in said for said in found.faults(found.scores[1])), found.faults(found.scores[1])
+
+
+def test_a_few_readings_decide_nothing():
+    one = compare(BRDFSamples.plain([0.3], [0.0], [0.5], [3.0], [0.2], [0.01]), ["lambertian", "lambertian+ggx"]).verdict()
+    assert "but not surely" in one[0]
+    assert "1 readings are few: what describes them may be wrong elsewhere" in one
+    nothing = compare(BRDFSamples.plain([0.3, 0.5, 0.7], 0.0, 0.5, 3.0, np.zeros(3), 0.01), ["lambertian"])
+    assert nothing.scores[0].parameters["lambertian.albedo"][0] < 0.05
