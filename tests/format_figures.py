@@ -23,6 +23,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 import gonio
 from gonio import formats
+from gonio.brdf import grained
+from gonio.brdf.tables import Tables
 from gonio.brdf.tabulated import tabulate
 from gonio.formats import Material, klems, peers, rgl
 from gonio.geometry import unit_vector
@@ -156,7 +158,7 @@ def rgl_figures(folder: Path, of: str, material: Material, n: int = 4000) -> lis
 
 
 def grain_figures(folder: Path, n: int = 4000) -> list[Figure]:
-    """A brushed metal, which needs tables over four angles, through Mitsuba."""
+    """A brushed metal, which needs tables over four angles, through Mitsuba, and as a table stored and loaded."""
     material, of = materials.brushed(), "brushed, 0.15 and 0.4"
     formats.export("rgl", folder / "grain.bsdf", material=material)
     bsdf = peers.mitsuba_bsdf(folder / "grain.bsdf")
@@ -164,7 +166,11 @@ def grain_figures(folder: Path, n: int = 4000) -> list[Figure]:
     found, back = (peers.mitsuba_f_cos(bsdf, a, b)[:, 0] / b[:, 2] for a, b in ((wi, wr), (wr, wi)))
     relative = np.abs(found / material.evaluate(wi, wr)[0] - 1)
     skew = 2 * np.abs(found - back) / (found + back)
+    Tables((grained.from_brdf(material.brdfs[0]),)).save(folder / "grain.nc")
+    stored = np.abs(Tables.load(folder / "grain.nc").brdf().evaluate(wi, wr) / material.evaluate(wi, wr)[0] - 1)
     return [
+        Figure("netcdf", "gonio", of, "between nodes, rms", float(np.sqrt(np.mean(stored**2))), 5e-3),
+        Figure("netcdf", "gonio", of, "between nodes, 95th percentile", float(np.quantile(stored, 0.95))),
         Figure("rgl", "mitsuba", of, "between nodes, rms", float(np.sqrt(np.mean(relative**2)))),
         Figure("rgl", "mitsuba", of, "between nodes, 95th percentile", float(np.quantile(relative, 0.95))),
         Figure("rgl", "mitsuba", of, "reciprocity, rms", float(np.sqrt(np.mean(skew**2))), 5e-3),

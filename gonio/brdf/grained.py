@@ -35,7 +35,7 @@ from gonio.halfdiff import directions, half_difference
 from gonio.samples import BRDFSamples
 
 Array = NDArray[np.float64]
-SHAPE = (24, 16, 12, 12)  # nodes along phi_h, theta_h, theta_d, phi_d
+SHAPE = (36, 24, 12, 12)  # nodes along phi_h, theta_h, theta_d, phi_d
 START = 5 + BUCKETS  # sizes and number of buckets, the buckets; then cells and values
 FEWEST = 60
 

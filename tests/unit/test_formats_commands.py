@@ -163,7 +163,7 @@ def test_table_keeps_a_grain(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     found = Tables.load(run / "table.nc").brdf().f_r(some.theta_i, some.phi_i, some.theta_r, some.phi_r)
     assert np.median(np.abs(found / some.f_r[:, 0] - 1)) < 0.05
     found = answer(capsys, "info", run / "table.nc")
-    assert found["table_nodes"] == [24, 16, 12, 12]
+    assert found["table_nodes"] == [36, 24, 12, 12]
     # by a Monte Carlo of the albedo at normal incidence: E[f_r pi] over directions weighted with the cosine
     u, phi = np.random.default_rng(1).random((2, 200_000))
     one = material.evaluate(
