@@ -14,7 +14,6 @@ tile's readings and estimates, written last. A tile whose checksums do not fit i
 
 from __future__ import annotations
 
-import functools
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -53,7 +52,6 @@ def is_cube(path: Path) -> bool:
     return path.is_dir() and any((path / name).is_file() for name in ("zarr.json", ".zgroup"))
 
 
-@functools.lru_cache(maxsize=4)
 def _opened(path: str) -> Any:
     try:
         return zarr().open_group(path, mode="r")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import resource
 import shutil
@@ -77,6 +78,21 @@ def test_other_options_and_other_folders_are_not_mixed_up(tmp_path, capsys):
     assert "there is no theta_r" in capsys.readouterr().err
 
 
+def test_a_shared_scale_of_a_cube_widens_its_pixels(tmp_path):
+    cube(tmp_path / "cube.zarr", (1, 2))
+    assert fit(tmp_path / "cube.zarr", tmp_path / "alone.zarr", "--processes", "1") == 0
+    group, n = zarr.open_group(tmp_path / "cube.zarr", mode="r+"), len(JOB.samples)
+    for name, array in (("d_omega_i", np.zeros((n, 3, 1))), ("d_omega_r", np.zeros((n, 3, 1))), ("d_ln_f", np.ones((n, 1)))):
+        group.create_array(name, shape=array.shape, dtype=array.dtype)[...] = array
+    group.attrs["shared_errors"] = [{"name": "scale", "u": 0.05}]
+    assert fit(tmp_path / "cube.zarr", tmp_path / "shared.zarr", "--processes", "1") == 0
+    alone, shared = (zarr.open_group(tmp_path / f"{name}.zarr", mode="r") for name in ("alone", "shared"))
+    assert shared.attrs["parameters"][-1] == "shared.scale"
+    albedo, sd, sd_alone = (np.asarray(a[...])[0, :, 0] for a in (shared["mean"], shared["sd"], alone["sd"]))
+    assert np.all(sd > 3 * sd_alone)
+    assert sd == pytest.approx(0.05 * albedo, rel=0.25)  # a little less where the range of albedo ends
+
+
 def test_channels_of_a_file_are_pixels(tmp_path):
     """Three channels of noise-free paper in CSV, uncertainty unknown."""
     theta = np.linspace(0.0, 70.0, 20)
@@ -120,6 +136,14 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(tmp_path, monkeypat
         assert fit(tmp_path / "cube.zarr", tmp_path / "there.zarr", "--scheduler", cluster.scheduler_address) == 0
     assert killed
     assert content(tmp_path / "here.zarr") == content(tmp_path / "there.zarr")
+
+
+def test_emcee_confirms_a_pixel(tmp_path, capsys):
+    cube(tmp_path / "cube.zarr", (1, 2))
+    assert fit(tmp_path / "cube.zarr", tmp_path / "fits.zarr", "--processes", "1", "--validate", "1", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["validated"], told["computed"]) == (1, 1)
+    assert 0.0 < told["largest_shift"] < 0.15
 
 
 def test_no_scheduler_is_one_sentence(tmp_path, capsys):
