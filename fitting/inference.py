@@ -127,7 +127,7 @@ def fit(
     if isinstance(samples, ChannelSamples):
         parts = samples.all_channels()
         index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        channels, samples = Channelled(samples.channels.names, index, tied), BRDFSamples.together(parts)
+        channels, samples = Channelled(samples.channels.names, index, tied), BRDFSamples.joined(parts)
     elif tied:
         raise ParameterError(f"tie: {tied[0]!r} is one number anyway, as the samples have one channel")
     given = len(samples)

@@ -135,6 +135,12 @@ class Posterior:
             terms.append(brdfs.Term(model, model.values({short: values[name] for short, name in names.items()})))
         return brdfs.BRDF(terms)
 
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels of a fit to several, in order; empty for a fit to one."""
+        found = (n[n.index("[") + 1 : -1] for n in (*self.names, *self.fixed) if n.endswith("]"))
+        return tuple(dict.fromkeys(found))
+
     def channel(self, name: str) -> Posterior:
         """Of one channel of a fit to several: its parameters without the channel's name, and those that all have in common.
 
@@ -144,9 +150,8 @@ class Posterior:
             If there is no such channel; the message lists them.
         """
         ending = f"[{name}]"
-        known = {n[n.index("[") + 1 : -1] for n in (*self.names, *self.fixed) if n.endswith("]")}
-        if name not in known:
-            raise ParameterError(f"the posterior has no channel {name!r}; it has: {', '.join(sorted(known)) or 'one only'}")
+        if name not in self.channels:
+            raise ParameterError(f"the posterior has no channel {name!r}; it has: {', '.join(self.channels) or 'one only'}")
         kept = [i for i, n in enumerate(self.names) if n.endswith(ending) or not n.endswith("]")]
         fixed = {n.removesuffix(ending): v for n, v in self.fixed.items() if n.endswith(ending) or not n.endswith("]")}
         names = tuple(self.names[i].removesuffix(ending) for i in kept)

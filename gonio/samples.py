@@ -120,7 +120,7 @@ class BRDFSamples:
         return replace(self, **arrays)
 
     @classmethod
-    def together(cls, parts: Sequence[BRDFSamples]) -> BRDFSamples:
+    def joined(cls, parts: Sequence[BRDFSamples]) -> BRDFSamples:
         """The samples of several sets with the same shared errors, one after the other; attributes are the first one's."""
         if any(part.shared != parts[0].shared for part in parts):
             raise DatasetError("samples: sets with different shared errors cannot be put together")
@@ -208,9 +208,4 @@ def together(runs: Sequence[BRDFSamples], u_mount: float) -> BRDFSamples:
             d_i[:, :, at], d_r[:, :, at], d_f[:, at] = run.d_omega_i[:, :, j], run.d_omega_r[:, :, j], run.d_ln_f[:, j]
         d_f[:, own["mount"]] = 1.0
         wide.append(replace(run, shared=tuple(errors.values()), d_omega_i=d_i, d_omega_r=d_r, d_ln_f=d_f))
-    arrays: dict[str, Any] = {
-        f.name: np.concatenate([getattr(run, f.name) for run in wide])
-        for f in fields(BRDFSamples)
-        if f.name not in ("shared", "attributes")
-    }
-    return replace(wide[0], **arrays, attributes=runs[0].attributes)
+    return BRDFSamples.joined(wide)

@@ -68,6 +68,7 @@ def table(run: Path, fill: bool, channel: str | None, as_json: bool) -> None:
     show_default=True,
     help="Relative uncertainty of putting a sample back, for --with.",
 )
+@click.option("--channels", is_flag=True, help="All channels of RUN at once: one roughness, and an albedo of each.")
 @click.option("--threads", type=int, default=1, help="For the likelihood; the numbers do not depend on it.")
 @json_option
 def fit(
@@ -83,6 +84,7 @@ def fit(
     resume: bool,
     others: tuple[Path, ...],
     mount: float,
+    channels: bool,
     threads: int,
     as_json: bool,
 ) -> None:
@@ -93,8 +95,10 @@ def fit(
     options |= {key: value for key, value in given.items() if value is not None} | {"chain": chain, "threads": threads}
     with speaking(as_json) as output, steps.open_run(run) as opened:
         if resume:
-            options["resume"] = steps.load_posterior(opened)
-        posterior = steps.fit(opened, output, model, seed, others=others, u_mount=mount, **options)
+            options["resume"] = steps.load_posterior(opened, whole=True)
+        posterior = steps.fit(
+            opened, output, model, seed, others=others, u_mount=mount, channels=channels, **options
+        )
         steps.show_fit(output, posterior)
         if not posterior.diagnostics.get("converged"):
             output.finish()

@@ -89,13 +89,17 @@ def load_table(run: Run) -> Tables:
     return Tables.load(run.table_path)
 
 
-def load_posterior(run: Run) -> Posterior:
-    """The fit of a run."""
+def load_posterior(run: Run, *, whole: bool = False) -> Posterior:
+    """The fit of a run; of one to several channels, that of the main one unless the `whole` is wanted."""
+    from gonio.channels import from_names
     from gonio.posterior import Posterior
 
     if not run.posterior_path.exists():
         raise DatasetError(f"{run.path} has no fit yet; make it with: gonio fit {run.path} --model lambertian+ggx")
-    return Posterior.load(run.posterior_path)
+    posterior = Posterior.load(run.posterior_path)
+    if whole or not posterior.channels:
+        return posterior
+    return posterior.channel(posterior.channels[from_names(posterior.channels, str(run.posterior_path)).main])
 
 
 def remounts(run: Run, others: Sequence[Path | str], u_mount: float) -> BRDFSamples:
@@ -112,16 +116,20 @@ def remounts(run: Run, others: Sequence[Path | str], u_mount: float) -> BRDFSamp
 
 
 def fit(
-    run: Run, output: Output, model: str, seed: int, *, others: Sequence[Path] = (), u_mount: float = 0.0, **options: Any
-) -> Posterior:
+    run: Run, output: Output, model: str, seed: int, *, others: Sequence[Path] = (), u_mount: float = 0.0,
+    channels: bool = False, **options: Any,
+) -> Posterior:  # fmt: skip
     """Samples to a posterior, written as posterior.nc; angles among the options as a user writes them, in degrees.
 
     `others` are runs of the same sample after remounting, each with a relative error of its own of sd `u_mount`.
+    With `channels`, all channels at once: one roughness, and an albedo of each.
     """
     from fitting import fit as run_fit
     from gonio.cli.units import angles_of_fit, fit_options
 
-    samples = remounts(run, others, u_mount)
+    if channels and others:
+        raise ConfigurationError("--channels and --with exclude each other; fit remounted runs one channel at a time")
+    samples = all_samples(run) if channels else remounts(run, others, u_mount)
     options = fit_options(options, angles_of_fit(model, samples))
     with output.stage("fit") as progress:
         posterior = run_fit(samples, model, seed=seed, progress=progress, **options)

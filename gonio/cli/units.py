@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 from gonio.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from gonio.channels import ChannelSamples
     from gonio.samples import BRDFSamples
 
 DEG = "_deg"
 _DEGREE = math.radians(1.0)
 
 
-def angles_of_fit(model: str, samples: BRDFSamples) -> set[str]:
+def angles_of_fit(model: str, samples: BRDFSamples | ChannelSamples) -> set[str]:
     """Names of a fit's parameters that are angles [rad], such as ``"oren_nayar.sigma"`` and ``"shared.arm"``."""
     from gonio.brdf import parse, term_names
 
@@ -23,7 +24,8 @@ def angles_of_fit(model: str, samples: BRDFSamples) -> set[str]:
     found = {
         f"{t}.{p.name}" for t, m in zip(term_names(models), models, strict=True) for p in m.parameters if p.unit == "rad"
     }
-    return found | {f"shared.{error.name}" for error in samples.shared if error.unit == "rad"}
+    shared = getattr(samples, "shared", ())  # several channels have none
+    return found | {f"shared.{error.name}" for error in shared if error.unit == "rad"}
 
 
 def fit_options(written: Mapping[str, Any], angles: set[str]) -> dict[str, Any]:

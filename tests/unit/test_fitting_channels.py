@@ -9,6 +9,8 @@ import pytest
 
 from fitting import Rule, fit
 from gonio.channels import RGB, ChannelSamples
+from gonio.cli.main import main
+from gonio.cli.steps import load_posterior, open_run
 from gonio.errors import ParameterError
 from gonio.posterior import Posterior
 from gonio.samples import BRDFSamples
@@ -61,6 +63,25 @@ def test_a_tied_reflectance_is_one_number():
     assert {held.fixed[f"ggx.f_0[{c}]"] for c in RGB.names} == {0.05}
 
 
+def test_channels_of_an_imported_file_share_a_fit(tmp_path):
+    """Paper in CSV: an albedo of each channel in one posterior, and the green one for whoever wants a material."""
+    rng = np.random.default_rng(1)
+    lines = ["theta_i_deg,phi_i_deg,theta_r_deg,phi_r_deg,f_r_red,f_r_green,f_r_blue"]
+    for theta in range(5, 65, 3):
+        f = [f"{a / math.pi * (1 + 0.01 * rng.normal()):.6f}" for a in ALBEDO]
+        lines.append(f"{theta},0,30,180,{','.join(f)}")
+    (tmp_path / "paper.csv").write_text("\n".join(lines) + "\n")
+    given = [str(tmp_path / "paper.csv"), "--quantity", "brdf", "--out", str(tmp_path / "run")]
+    assert main(["import", *given]) == 0
+    assert main(["fit", str(tmp_path / "run"), "--model", "lambertian", "--channels"]) == 0
+    posterior = Posterior.load(tmp_path / "run" / "posterior.nc")
+    for channel, albedo in zip(RGB.names, ALBEDO, strict=True):
+        s = posterior.channel(channel).summary()["lambertian.albedo"]
+        assert abs(s["mean"] - albedo) < 4 * s["sd"]
+    with open_run(tmp_path / "run") as opened:
+        assert load_posterior(opened).brdf().parameters()["lambertian.albedo"] == pytest.approx(ALBEDO[1], rel=0.02)
+
+
 def test_wrong_channels_and_ties_are_one_sentence(tmp_path):
     with pytest.raises(ParameterError, match=r"tie: 'ggx.f0' is no linear parameter .did you mean 'ggx.f_0'"):
         fit(measured(), tie=["ggx.f0"])
@@ -69,5 +90,5 @@ def test_wrong_channels_and_ties_are_one_sentence(tmp_path):
     posterior = fit(measured(), "lambertian", seed=1, discrepancy=False, rule=Rule(effective=400))
     posterior.save(tmp_path / "p.nc")
     assert Posterior.load(tmp_path / "p.nc").channel("green").names == ("lambertian.albedo",)
-    with pytest.raises(ParameterError, match="no channel 'gren'; it has: blue, green, red"):
+    with pytest.raises(ParameterError, match="no channel 'gren'; it has: red, green, blue"):
         posterior.channel("gren")
