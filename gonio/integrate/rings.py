@@ -11,6 +11,8 @@ is below 0 where the field is not: where the error allows one, it is raised to 0
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,7 @@ from gonio.integrate.spectrum import spectrum
 Array = NDArray[np.float64]
 _STEP = 1.5  # digits from one sum to the next
 _STEADY, _SLOW = 2.0, 5.0  # of the difference of two sums, which should be thirty times what is left in the finer one
-_DOUBT = 0.1  # of the digits asked for: two sums may agree by chance
+_DOUBT = 1.0  # of the digits asked for: two sums may agree by chance, or take as many nodes
 FEW = 96  # distinct slopes up to which each is summed by itself
 
 
@@ -98,7 +100,7 @@ def _directly(
 ) -> tuple[Array, Array]:
     """Each slope by itself, with more digits and more waves until the tolerance is met."""
     value, error = np.zeros(len(phi)), np.full(len(phi), np.inf)
-    digits = first_digits(rtol)
+    digits = max(first_digits(rtol), min(MOST_DIGITS - 2.0 * _STEP, 0.5 - _STEP - math.log10(rtol)))
     waves = min(most, scene.first_waves)
     pending = np.arange(len(slopes))
     rough, before = scene.sums(slopes, digits, waves), np.full(len(slopes), np.inf)
