@@ -51,7 +51,8 @@ def read(path: Path) -> ChannelSamples:
     waves, key = np.unique(data[:, 0], return_inverse=True)
     if len(waves) > 2000:
         raise DatasetError(f"{path}: {len(waves)} different wavelengths, at most 2000 are read; thin the file")
-    channels = spectral(np.round(waves * 1e9, 6), str(path))
+    with np.errstate(over="ignore"):  # an absurd one becomes infinite, which is refused
+        channels = spectral(np.round(waves * 1e9, 6), str(path))
     flip = data[:, 2] < 0  # a negative polar angle is on the other side
     data[:, 3] = np.where(flip, data[:, 3] + np.pi, data[:, 3])
     data[:, 1:3] = np.abs(data[:, 1:3])
