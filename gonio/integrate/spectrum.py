@@ -220,6 +220,7 @@ def _first_breaks(field: Field) -> list[float]:
 
 
 def _of_samples(field: Field, tolerance: float) -> Spectrum:
+    tolerance = max(tolerance, 8.0 * EPS / field.detail)  # a rounded direction tells no more
     nodes, matrix = _to_series(_DEGREE)
     probes = np.array([-0.97, -0.3, 0.45, 0.99])
     at_probes = np.polynomial.chebyshev.chebvander(probes, _DEGREE) @ matrix

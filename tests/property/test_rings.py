@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 import gonio
 from gonio.brdf.tabulated import from_brdf
+from gonio.fields import Field
 from gonio.geometry import gradient_from_normal, unit_vector
 from gonio.integrate import scene_radiance
 from gonio.integrate.plan import Method
+from gonio.integrate.spectrum import spectrum
 from tests.independent import reflected_radiance
 
 make_source, make_brdf = gonio.source.make, gonio.brdf.make
@@ -116,6 +118,13 @@ def test_a_narrow_lobe_is_a_beam() -> None:
     rough = make_brdf("ggx", k_s=1.0, alpha=0.3, f_0=0.5)
     wide, narrow = (gonio.reflectance_map(rough, s, p, q, rtol=1e-6).value for s in (lobe, beam))
     assert np.all(wide > 0.0) and np.allclose(wide, narrow, rtol=1e-3)
+
+
+def test_the_series_of_the_narrowest_lobe_stops_at_rounding() -> None:
+    """Panels halved for digits that its values do not have would take gigabytes."""
+    lobe = make_source("lobes", amplitude=1.0, kappa=1e5, theta=1.9797, phi=4.13).parts[0]
+    assert isinstance(lobe, Field)
+    assert spectrum(lobe, 1e-14).series.nbytes < 1 << 27
 
 
 def test_the_result_does_not_depend_on_threads() -> None:
