@@ -232,7 +232,7 @@ class _Block:
             done.append((base[small], box[small]))
             finished += int(np.count_nonzero(small))
             base, box = _halve(base[~small], box[~small], ways[~small])
-            if (finished + len(base)) * NODES.size**2 > _LARGEST * len(self.fixed):
+            if (finished + len(base) - len(self.base)) * NODES.size**2 > _LARGEST * len(self.fixed):  # by halving
                 raise IntegrationError(
                     f"{self.term.model.name}: more than {_LARGEST} nodes around its lobes for one gradient"
                 )
