@@ -190,8 +190,11 @@ def misfit_limit(n_samples: int) -> float:
     return max(CHI2_LIMIT, 1.0 + 4.0 * math.sqrt(2.0 / n_samples))
 
 
-def entangled(names: Sequence[str], draws: Array) -> list[str]:
+def entangled(names: Sequence[str], draws: Array, shared: Array | None = None) -> list[str]:
     """A sentence for each pair of parameters that the data tell only together.
+
+    What the pair owes to the errors that all samples share, such as the scale of the white reference, is taken out first:
+    no other measurement would tell the two apart better.
 
     Parameters
     ----------
@@ -199,6 +202,8 @@ def entangled(names: Sequence[str], draws: Array) -> list[str]:
         Of the model's parameters.
     draws : ndarray, shape (s, d)
         Of all of them; ranks are compared, so a curved valley counts.
+    shared : ndarray, shape (s, k), optional
+        Draws of the shared errors.
     """
     from scipy.stats import rankdata
 
@@ -206,6 +211,10 @@ def entangled(names: Sequence[str], draws: Array) -> list[str]:
         return []
     rank = rankdata(draws, axis=0)
     rank = rank - rank.mean(axis=0)
+    if shared is not None and shared.shape[1] > 0:
+        common = rankdata(shared, axis=0)
+        common = common - common.mean(axis=0)
+        rank = rank - common @ np.linalg.lstsq(common, rank, rcond=None)[0]
     norm = np.sqrt(np.sum(rank**2, axis=0))
     correlation = (rank.T @ rank) / np.maximum(np.outer(norm, norm), 1e-300)
     return [

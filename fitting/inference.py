@@ -176,7 +176,8 @@ def fit(
         scaled="noise.scale" in names,
         incidences=len(np.unique(np.round(samples.theta_i, 3))),
     )
-    said += entangled(problem.model_names, x[:, [names.index(name) for name in problem.model_names]])
+    errors = [i for i, name in enumerate(names) if name.startswith("shared.")]
+    said += entangled(problem.model_names, x[:, [names.index(name) for name in problem.model_names]], x[:, errors])
     if given > len(samples):
         said.append(f"a random {len(samples)} of {given} samples were used; raise max_samples to use more")
     if not found.converged:

@@ -92,3 +92,7 @@ def test_parameters_that_only_their_product_is_known_of_are_named():
     assert "ggx.f_0 and ggx.k_s only together (rank correlation -1.00)" in said
     assert entangled(("a", "b"), draws[:, :2]) == []
     assert entangled(("a",), draws[:, :1]) == []
+    scale = 0.05 * np.random.default_rng(2).normal(size=(2000, 1))
+    both = (1 + scale) * (1 + 0.005 * np.random.default_rng(3).normal(size=(2000, 2)))
+    assert len(entangled(("a", "b"), both)) == 1
+    assert entangled(("a", "b"), both, scale) == []
