@@ -94,6 +94,19 @@ def _directions(base, slope, full, offset, varied, step, out):  # type: ignore[n
                     to[j] = max(to[j], 1e-12)
 
 
+@jit.part
+def shared_factor(errors, offset, log_slope, factor):  # type: ignore[no-untyped-def]
+    """What the shared errors that begin at `offset` multiply readings by: log_slope (k, n) -> factor (n,)."""
+    factor[:] = 0.0
+    for k in range(log_slope.shape[0]):
+        delta, by = errors[offset + k], log_slope[k]
+        if delta != 0.0:
+            for j in range(factor.size):
+                factor[j] += delta * by[j]
+    for j in range(factor.size):
+        factor[j] = exp(factor[j])
+
+
 def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_sample, step, u2, unknown, mean, var):  # type: ignore[no-untyped-def]
     """Expected readings and variances: values (w, 1 + v, n) -> mean, var (w, n)."""
     n = u2.size
@@ -101,14 +114,7 @@ def _moments(values, full, offset, noise, log_slope, has_log, noisy, variant, u_
         f, m, s2 = values[w, 0], mean[w], var[w]
         factor = np.ones(n)
         if has_log:
-            factor[:] = 0.0
-            for k in range(log_slope.shape[0]):
-                delta, by = full[w, offset + k], log_slope[k]
-                if delta != 0.0:
-                    for j in range(n):
-                        factor[j] += delta * by[j]
-            for j in range(n):
-                factor[j] = exp(factor[j])
+            shared_factor(full[w], offset, log_slope, factor)
         relative2, absolute2, epsilon2 = full[w, noise] ** 2, full[w, noise + 1] ** 2, full[w, noise + 2] ** 2
         scale2 = full[w, noise + 3] ** 2
         for j in range(n):

@@ -22,9 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fitting.likelihood import Problem
+from fitting.likelihood import Problem, shared_factor
 from gonio import jit
-from gonio.brdf.elementary import exp
 
 Array = NDArray[np.float64]
 
@@ -131,14 +130,9 @@ def _products(a, b, full, offset, log_slope, has_log, about, place, reading, roo
     rows, factor, scaled = np.empty((p + 1, n)), root.copy(), reading * root
     for w in range(out.shape[0]):
         if has_log:
-            factor[:] = 0.0
-            for k in range(log_slope.shape[0]):
-                delta, slope = full[w, offset + k], log_slope[k]
-                if delta != 0.0:
-                    for j in range(n):
-                        factor[j] += delta * slope[j]
+            shared_factor(full[w], offset, log_slope, factor)
             for j in range(n):
-                factor[j] = root[j] * exp(factor[j])
+                factor[j] *= root[j]
         left, known = rows[0], a[w, 0]
         for j in range(n):
             left[j] = scaled[j] - factor[j] * known[j]
