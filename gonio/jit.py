@@ -6,8 +6,11 @@ constants, so an edit anywhere recompiles and an undone edit hits again. Each ke
 symbols are named by content, so kernels of different processes cannot be taken for each other. A damaged or read-only
 cache means compiling again.
 
-This leans on private parts of numba (`FunctionCache`, the flag of arrays that do not overlap); tests/unit/test_jit.py shows
-that a second process hits, that edits miss and that the flag arrives.
+A kernel that does much besides a model's values is compiled once for all models and calls by its address (`address`,
+`calling`) what sums them.
+
+This leans on private parts of numba (`FunctionCache`, `CFunc`, the flag of arrays that do not overlap);
+tests/unit/test_jit.py shows that a second process hits, that edits miss and that the flag arrives.
 """
 
 from __future__ import annotations
@@ -23,16 +26,21 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core import caching
+from llvmlite import ir
+from numba.core import caching, cgutils, sigutils
+from numba.core.ccallback import CFunc
 from numba.core.dispatcher import Dispatcher
+from numba.core.types.containers import StarArgTuple
+from numba.extending import _Intrinsic, intrinsic
 
 # reassoc lets sums vectorise; no nnan and no ninf, so NaN and infinity stay what they are
 FAST = {"reassoc", "nsz", "contract", "arcp"}
 _BARE = {"no_cfunc_wrapper": True}  # nothing is passed as a function pointer; an eighth of the time to compile
-_PURE = ("math", "numpy", "numba", "builtins")
+_PURE = ("math", "numpy", "numba", "llvmlite", "builtins")
 _FORMAT = 3  # of what is kept; a new number discards the old files
 _compiled = 0  # kernels compiled, not loaded, by this process
 _seconds = 0.0  # spent on loading and compiling them
+_kept: list[CFunc] = []  # whose addresses are in use
 
 
 def compiled_count() -> int:
@@ -75,9 +83,7 @@ def kernel(function: Callable[..., Any], *, apart: bool = False, **options: Any)
         If the function uses an object whose content cannot be fingerprinted.
     """
     options = {"error_model": "numpy", "fastmath": FAST, "nogil": True} | options
-    text = repr([_FORMAT, numba.__version__, _shown(options), apart, _fingerprint(function, set())])
-    key = hashlib.sha256(text.encode()).hexdigest()
-    function = _named(function, key)
+    function, key = _keyed(function, options, apart)
     compiled = numba.njit(**_BARE, **options)(function)
     if apart:
         compiled._compiler._customize_flags = _apart
@@ -85,9 +91,58 @@ def kernel(function: Callable[..., Any], *, apart: bool = False, **options: Any)
     return compiled
 
 
+def _keyed(function: Callable[..., Any], options: dict[str, Any], *more: Any) -> tuple[Callable[..., Any], str]:
+    """The function under a name that tells what its machine code depends on, and the key of the cache."""
+    text = repr([_FORMAT, numba.__version__, _shown(options), *more, _fingerprint(function, set())])
+    key = hashlib.sha256(text.encode()).hexdigest()
+    return _named(function, key), key
+
+
 def _apart(flags: Any) -> Any:
     flags.noalias = True
     return flags
+
+
+def address(function: Callable[..., Any], signature: str, *, apart: bool = False) -> int:
+    """Compile a function to be called by its address, for as long as the process lives; its code is kept like a kernel's.
+
+    Parameters
+    ----------
+    function : callable
+        As for `kernel`. It must not raise.
+    signature : str
+        As numba writes it: ``"float64(float64[:,::1], int64)"``.
+    apart : bool, optional
+        As for `kernel`.
+    """
+    options = {"error_model": "numpy", "fastmath": FAST}
+    function, key = _keyed(function, options, signature, apart)
+    compiled: Any = CFunc(function, sigutils.normalize_signature(signature), {}, options)
+    compiled._cache = _Cache(function, key, cache_folder())
+    if apart:
+        customize = compiled._compiler._customize_flags
+        compiled._compiler._customize_flags = lambda flags: _apart(customize(flags))
+    compiled.compile()
+    _kept.append(compiled)
+    return int(compiled.address)
+
+
+def calling(signature: str) -> Any:
+    """For kernels: ``call(address, *arguments)`` calls what `address` compiled with this signature."""
+    arguments, result = sigutils.normalize_signature(signature)
+
+    @intrinsic
+    def call(typing, at, *given):  # type: ignore[no-untyped-def]
+        if len(given) != len(arguments) or not all(map(typing.can_convert, given, arguments)):
+            return None
+
+        def lower(context, builder, _, values):  # type: ignore[no-untyped-def]
+            kind = ir.FunctionType(context.get_value_type(result), [context.get_value_type(a) for a in arguments])
+            return builder.call(builder.inttoptr(values[0], kind.as_pointer()), cgutils.unpack_tuple(builder, values[1]))
+
+        return result(numba.int64, StarArgTuple(arguments)), lower
+
+    return call
 
 
 def cache_folder() -> Path:
@@ -122,6 +177,8 @@ def _fingerprint(value: Any, seen: set[Any]) -> Any:
     """What machine code made from `value` depends on: loaded code, constants and, recursively, the functions called."""
     if isinstance(value, Dispatcher):
         return ["jit", _shown(value.targetoptions), _fingerprint(value.py_func, seen)]
+    if isinstance(value, _Intrinsic):
+        return ["intrinsic", _fingerprint(value._defn, seen)]
     if isinstance(value, types.CodeType):
         constants = [_fingerprint(constant, seen) for constant in value.co_consts]
         return [value.co_code, value.co_names, value.co_varnames, value.co_freevars, constants]

@@ -30,7 +30,6 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -43,6 +42,7 @@ from gonio.integrate.cap import exponential, unit_rule
 from gonio.integrate.closed_forms import collimated
 from gonio.integrate.cut_disk import crosses
 from gonio.integrate.grid import BLOCK, Gradients, block
+from gonio.integrate.model_sums import over_nodes, over_rule, sum_over_nodes, sums_over_rule
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
@@ -133,11 +133,12 @@ def add(
     counts = np.zeros(3, dtype=np.int64)
     kinked = term.model.kinks is not None
     planes = term.kinks(gradients.elements(*tile).viewer()) if kinked else np.empty((0, 0, 4))
-    worst = _kernel(term.model.function)(
+    function = term.model.function
+    worst = _disks(
         gradients.p, gradients.q, *tile, np.array(cap.axis), cap.half_angle, cap.radiance * term.weight,
-        term.lobe_width() or 10.0, term.layer_width(), term.values, nodes, starts, np.array(_DEGREES), _reaches(rtol),
-        x, w, cuts, planes, kinked or term.model.pieces, term.model.shadowed, rtol, floor, value, error, left, crossed,
-        counts,
+        term.lobe_width() or 10.0, term.layer_width(), over_nodes(function), over_rule(function), term.values, nodes, starts,
+        np.array(_DEGREES), _reaches(rtol), x, w, cuts, planes, kinked or term.model.pieces, term.model.shadowed, rtol,
+        floor, value, error, left, crossed, counts,
     )  # fmt: skip
     rest, nodes_used = left[: counts[0]].astype(np.intp), int(counts[1])
     if counts[2]:
@@ -223,201 +224,189 @@ def small(g, sun, degree, bound, exponential):  # type: ignore[no-untyped-def]
     return power <= bound
 
 
-@functools.cache
-def _kernel(function: Any) -> Any:
-    def segment_rule(  # type: ignore[no-untyped-def]
-        ax, ay, az, s, c, half_angle, layer, near, parameters, x, w, cuts, rtol, floor, some, counts
-    ):
-        """Integral over a disk that the horizon cuts, and its error beyond rtol; negative if the rules don't agree."""
-        # e points up the disk, away from the horizon; f along it
-        up = math.sqrt(1.0 - az * az)
-        ex, ey, ez = -ax * az / up, -ay * az / up, up
-        fx, fy = ay * ez - az * ey, az * ex - ax * ez
-        rho = math.tan(half_angle)
-        end = math.acos(min(max(-az / (up * rho), -1.0), 1.0))
-        width = min(layer / (rho * up * max(math.sin(end), 1e-3)), 10.0)  # of the horizon's layer, in psi
-        reach = math.asinh(end / width)
-        first = 0  # along the lines that are parallel to the horizon only the lobe counts
-        while first < cuts.size - 2 and 64.0 * near ** (2.0 * (cuts[first + 1] - cuts[first])) > 0.25 * rtol:
-            first += 1
-        before = earlier = -1.0
-        for level in range(1, cuts.size - 1):
-            n, begin = cuts[level + 1] - cuts[level], cuts[min(first + level - 1, cuts.size - 2)]
-            m = cuts[min(first + level, cuts.size - 1)] - begin
-            at = 0
-            for i in range(n):
-                e = exponential(reach * x[cuts[level] + i])
-                sin_psi, cos_psi = sine_and_cosine(end - 0.5 * width * (e - 1.0 / e))
-                across = rho * sin_psi
-                some[4, i], some[5, i] = rho * cos_psi, across
-                some[6, i] = width * (e + 1.0 / e) * reach * w[cuts[level] + i] * across * across
-            for i in range(n):
-                u, across, weight = some[4, i], some[5, i], some[6, i]
-                bx, by, bz = ax + u * ex, ay + u * ey, az + u * ez
-                some_u = 1.0 + u * u
-                for j in range(m):
-                    v = across * (2.0 * x[begin + j] - 1.0)
-                    r = 1.0 / math.sqrt(some_u + v * v)
-                    some[0, at + j], some[1, at + j], some[2, at + j] = (bx + v * fx) * r, (by + v * fy) * r, bz * r
-                    some[3, at + j] = weight * w[begin + j] * (r * r * r)
-                at += m
-            total = 0.0
-            for j in range(at):
-                zi = some[2, j]
+def _segment_rule(  # type: ignore[no-untyped-def]
+    ax, ay, az, s, c, half_angle, layer, near, weigh, parameters, x, w, cuts, rtol, floor, some, counts
+):
+    """Integral over a disk that the horizon cuts, and its error beyond rtol; negative if the rules don't agree."""
+    # e points up the disk, away from the horizon; f along it
+    up = math.sqrt(1.0 - az * az)
+    ex, ey, ez = -ax * az / up, -ay * az / up, up
+    fx, fy = ay * ez - az * ey, az * ex - ax * ez
+    rho = math.tan(half_angle)
+    end = math.acos(min(max(-az / (up * rho), -1.0), 1.0))
+    width = min(layer / (rho * up * max(math.sin(end), 1e-3)), 10.0)  # of the horizon's layer, in psi
+    reach = math.asinh(end / width)
+    first = 0  # along the lines that are parallel to the horizon only the lobe counts
+    while first < cuts.size - 2 and 64.0 * near ** (2.0 * (cuts[first + 1] - cuts[first])) > 0.25 * rtol:
+        first += 1
+    before = earlier = -1.0
+    for level in range(1, cuts.size - 1):
+        n, begin = cuts[level + 1] - cuts[level], cuts[min(first + level - 1, cuts.size - 2)]
+        m = cuts[min(first + level, cuts.size - 1)] - begin
+        at = 0
+        for i in range(n):
+            e = exponential(reach * x[cuts[level] + i])
+            sin_psi, cos_psi = sine_and_cosine(end - 0.5 * width * (e - 1.0 / e))
+            across = rho * sin_psi
+            some[4, i], some[5, i] = rho * cos_psi, across
+            some[6, i] = width * (e + 1.0 / e) * reach * w[cuts[level] + i] * across * across
+        for i in range(n):
+            u, across, weight = some[4, i], some[5, i], some[6, i]
+            bx, by, bz = ax + u * ex, ay + u * ey, az + u * ez
+            some_u = 1.0 + u * u
+            for j in range(m):
+                v = across * (2.0 * x[begin + j] - 1.0)
+                r = 1.0 / math.sqrt(some_u + v * v)
+                some[0, at + j], some[1, at + j] = (bx + v * fx) * r, (by + v * fy) * r
+                zi = bz * r
                 zi = zi if zi > 1e-300 else 1e-300
-                total += some[3, j] * zi * function(some[0, j], some[1, j], zi, -s, 0.0, c, parameters)
-            counts[1] += at
-            if total <= 0.01 * floor:
-                return total, floor if total > 0.0 else _UNDERFLOW
-            if before >= 0.0:
-                step = abs(total - before)
-                estimate = 2.0 * step
-                if earlier >= 0.0:
-                    estimate = max(step, 0.01 * abs(before - earlier))
-                if estimate <= 0.25 * rtol * total:
-                    return total, 0.0
-                if estimate <= 0.1 * floor:
-                    return total, floor
-            earlier, before = before, total
-        return -1.0, 0.0
+                some[2, at + j], some[3, at + j] = zi, weight * w[begin + j] * (r * r * r) * zi
+            at += m
+        total = sum_over_nodes(weigh, some, at, s, c, parameters)
+        counts[1] += at
+        if total <= 0.01 * floor:
+            return total, floor if total > 0.0 else _UNDERFLOW
+        if before >= 0.0:
+            step = abs(total - before)
+            estimate = 2.0 * step
+            if earlier >= 0.0:
+                estimate = max(step, 0.01 * abs(before - earlier))
+            if estimate <= 0.25 * rtol * total:
+                return total, 0.0
+            if estimate <= 0.1 * floor:
+                return total, floor
+        earlier, before = before, total
+    return -1.0, 0.0
 
-    segment = jit.part(segment_rule, fastmath=jit.FAST)  # its sums vectorise
 
-    def disks(  # type: ignore[no-untyped-def]
-        p, q, start, stop, axis, half_angle, scale, width, depth, parameters, nodes, starts, degrees, reaches, x, w, cuts,
-        planes, rough, shadowed, rtol, floor, value, error, left, crossed, counts,
-    ):  # fmt: skip
-        worst, rules, kinks = 0.0, degrees.size, planes.shape[1]
-        dx, dy, dz = axis[0], axis[1], axis[2]
-        sine, cosine = math.sin(half_angle), math.cos(half_angle)
-        bound = 0.25 * rtol / _SAFETY
-        flat = np.empty((7, _CUT[-1] ** 2))
-        solid = 4.0 * math.pi * math.sin(0.5 * half_angle) ** 2
-        g, now = np.empty((11, BLOCK)), np.empty((11, BLOCK))  # axis and tangents in the local frame, sin, cos theta_n
-        sums, most, least = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
-        nearness, chosen = np.empty(BLOCK), np.empty(BLOCK, dtype=np.int64)
-        level, history = np.empty(BLOCK, dtype=np.int64), np.empty((2, BLOCK))
-        row = np.empty((6, BLOCK))
-        begin, size = start, 0
-        while begin + size < stop:
-            begin += size
-            size = block(p, q, begin, stop, row)
-            lowest = rules
-            for k in range(size):
-                c, s, cf, sf = row[0, k], row[1, k], row[2, k], row[3, k]
-                along = dx * cf + dy * sf
-                ax, ay, az = along * c - dz * s, dy * cf - dx * sf, along * s + dz * c
-                level[k] = rules
-                if az <= -sine:
+_segment = jit.part(_segment_rule, fastmath=jit.FAST)
+
+
+def _all_disks(  # type: ignore[no-untyped-def]
+    p, q, start, stop, axis, half_angle, scale, width, depth, weigh, apply, parameters, nodes, starts, degrees, reaches, x,
+    w, cuts, planes, rough, shadowed, rtol, floor, value, error, left, crossed, counts,
+):  # fmt: skip
+    worst, rules, kinks = 0.0, degrees.size, planes.shape[1]
+    dx, dy, dz = axis[0], axis[1], axis[2]
+    sine, cosine = math.sin(half_angle), math.cos(half_angle)
+    bound = 0.25 * rtol / _SAFETY
+    flat = np.empty((7, _CUT[-1] ** 2))
+    solid = 4.0 * math.pi * math.sin(0.5 * half_angle) ** 2
+    g, now = np.empty((11, BLOCK)), np.empty((11, BLOCK))  # axis and tangents in the local frame, sin, cos theta_n
+    out = np.empty((3, BLOCK))
+    sums, most, least = out[0], out[1], out[2]
+    nearness, chosen = np.empty(BLOCK), np.empty(BLOCK, dtype=np.int64)
+    level, history = np.empty(BLOCK, dtype=np.int64), np.empty((2, BLOCK))
+    row = np.empty((6, BLOCK))
+    begin, size = start, 0
+    while begin + size < stop:
+        begin += size
+        size = block(p, q, begin, stop, row)
+        lowest = rules
+        for k in range(size):
+            c, s, cf, sf = row[0, k], row[1, k], row[2, k], row[3, k]
+            along = dx * cf + dy * sf
+            ax, ay, az = along * c - dz * s, dy * cf - dx * sf, along * s + dz * c
+            level[k] = rules
+            if az <= -sine:
+                continue
+            # distance of the lobe from the disk's axis, real and imaginary; a grazing view's is a streak
+            off, across = math.hypot(ax - s, ay), width * (az + c)
+            layer = min(depth, c) if shadowed and (width < 10.0 or kinks > 0) else 1.0
+            lobe = 0.6 * half_angle
+            if width < 10.0:
+                lobe = max(lobe, _MARGIN * inverse(off, across, sine))
+            near = max(lobe, _MARGIN * inverse(az, layer, sine))
+            cut = False
+            for j in range(kinks):
+                plane = planes[begin + k - start, j]
+                cut = cut or crosses(plane[0], plane[1], plane[2], plane[3], ax, ay, az, sine, cosine)
+            if cut or az <= sine:
+                far = math.hypot(off, across) * _FINER / half_angle
+                if cut and far > 1.0:
+                    crossed[counts[2]] = begin + k
+                    counts[2] += 1
                     continue
-                # distance of the lobe from the disk's axis, real and imaginary; a grazing view's is a streak
-                off, across = math.hypot(ax - s, ay), width * (az + c)
-                layer = min(depth, c) if shadowed and (width < 10.0 or kinks > 0) else 1.0
-                lobe = 0.6 * half_angle
-                if width < 10.0:
-                    lobe = max(lobe, _MARGIN * inverse(off, across, sine))
-                near = max(lobe, _MARGIN * inverse(az, layer, sine))
-                cut = False
-                for j in range(kinks):
-                    plane = planes[begin + k - start, j]
-                    cut = cut or crosses(plane[0], plane[1], plane[2], plane[3], ax, ay, az, sine, cosine)
-                if cut or az <= sine:
-                    far = math.hypot(off, across) * _FINER / half_angle
-                    if cut and far > 1.0:
-                        crossed[counts[2]] = begin + k
-                        counts[2] += 1
-                        continue
-                    total, faint = -1.0, 0.0
-                    if not cut and far > 1.0 and layer > 0.02 * half_angle and az > -0.99999 * sine:
-                        total, faint = segment(
-                            ax, ay, az, s, c, half_angle, layer, lobe, parameters, x, w, cuts, rtol, floor, flat, counts
-                        )
-                    if total < 0.0:
-                        left[counts[0]] = begin + k
-                        counts[0] += 1
-                    else:
-                        height = min(az + sine, sine)
-                        relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 16.0 / height)
-                        value[begin + k] += scale * total
-                        error[begin + k] += scale * (relative * total + faint)
-                        worst = max(worst, relative)
-                    continue
-                first = 0
-                while first < rules and near > reaches[first]:
-                    first += 1
-                if first == rules:
+                total, faint = -1.0, 0.0
+                if not cut and far > 1.0 and layer > 0.02 * half_angle and az > -0.99999 * sine:
+                    total, faint = _segment(
+                        ax, ay, az, s, c, half_angle, layer, lobe, weigh, parameters, x, w, cuts, rtol, floor, flat, counts
+                    )
+                if total < 0.0:
                     left[counts[0]] = begin + k
                     counts[0] += 1
-                    continue
-                level[k], nearness[k] = first, near
-                lowest = min(lowest, first)
-                history[0, k] = history[1, k] = -1.0
-                g[0, k], g[1, k], g[2, k] = ax, ay, az
-                g[3, k], g[4, k], g[5, k], g[6, k], g[7, k], g[8, k] = tangents(ax, ay, az)
-                g[9, k], g[10, k] = s, c
-            for rule in range(lowest, rules):
-                m = 0
-                for k in range(size):
-                    if level[k] == rule:
-                        chosen[m] = k
-                        m += 1
-                if m == 0:
-                    continue
-                for r in range(11):
-                    for i in range(m):
-                        now[r, i] = g[r, chosen[i]]
-                some, high, low = sums[:m], most[:m], least[:m]
-                some[:], high[:], low[:] = 0.0, 0.0, math.inf
-                ax_, ay_, az_, s_, c_ = now[0, :m], now[1, :m], now[2, :m], now[9, :m], now[10, :m]
-                ex_, ey_, ez_, fx_, fy_, fz_ = now[3, :m], now[4, :m], now[5, :m], now[6, :m], now[7, :m], now[8, :m]
-                for j in range(starts[rule], starts[rule + 1]):
-                    t, u, v, weight = nodes[0, j], nodes[1, j], nodes[2, j], nodes[3, j]
-                    for k in range(m):
-                        zi = t * az_[k] + u * ez_[k] + v * fz_[k]
-                        xi, yi = t * ax_[k] + u * ex_[k] + v * fx_[k], t * ay_[k] + u * ey_[k] + v * fy_[k]
-                        f = function(xi, yi, zi, -s_[k], 0.0, c_[k], parameters)
-                        some[k] += weight * zi * f
-                        high[k] = f if f > high[k] else high[k]
-                        low[k] = f if f < low[k] else low[k]
-                counts[1] += m * (starts[rule + 1] - starts[rule])
+                else:
+                    height = min(az + sine, sine)
+                    relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 16.0 / height)
+                    value[begin + k] += scale * total
+                    error[begin + k] += scale * (relative * total + faint)
+                    worst = max(worst, relative)
+                continue
+            first = 0
+            while first < rules and near > reaches[first]:
+                first += 1
+            if first == rules:
+                left[counts[0]] = begin + k
+                counts[0] += 1
+                continue
+            level[k], nearness[k] = first, near
+            lowest = min(lowest, first)
+            history[0, k] = history[1, k] = -1.0
+            g[0, k], g[1, k], g[2, k] = ax, ay, az
+            g[3, k], g[4, k], g[5, k], g[6, k], g[7, k], g[8, k] = tangents(ax, ay, az)
+            g[9, k], g[10, k] = s, c
+        for rule in range(lowest, rules):
+            m = 0
+            for k in range(size):
+                if level[k] == rule:
+                    chosen[m] = k
+                    m += 1
+            if m == 0:
+                continue
+            for r in range(11):
                 for i in range(m):
-                    k, total = chosen[i], sums[i]
-                    before, earlier = history[0, k], history[1, k]
-                    spread, low_sun = math.inf, sine / g[2, k]
-                    if shadowed and total > 0.0:
-                        spread = 0.5 * solid * g[2, k] * (most[i] - least[i]) / total
-                    elif total > 0.0 and least[i] > 0.0:
-                        spread = 0.5 * math.log(most[i] / least[i])
-                    good = not rough and nearness[k] <= reaches[rule]
-                    good = good and small(spread, low_sun, degrees[rule], bound, not shadowed)
-                    faint = 0.0
-                    if total <= 0.01 * floor:
-                        good, faint = good or not rough, floor if total > 0.0 else _UNDERFLOW
-                    if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
-                        step = abs(total - before)
-                        estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
-                        good = estimate <= 0.25 * rtol * total
-                        if not good and estimate <= 0.1 * floor:
-                            good, faint = True, floor
-                    history[0, k], history[1, k] = total, before
-                    if good:
-                        relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 4.0 / g[2, k])
-                        value[begin + k] += scale * total
-                        error[begin + k] += scale * (relative * total + faint)
-                        worst = max(worst, relative)
-                    elif rule == rules - 1:
-                        left[counts[0]] = begin + k
-                        counts[0] += 1
-                    else:
-                        following = rule + 1
-                        while (
-                            not rough
-                            and (spread < _FLAT or (not shadowed and spread < 30.0))
-                            and following < rules - 1
-                            and not small(spread, low_sun, degrees[following], bound, not shadowed)
-                        ):
-                            following += 1
-                        level[k] = following
-        return worst
+                    now[r, i] = g[r, chosen[i]]
+            sums_over_rule(apply, now, m, nodes, starts[rule], starts[rule + 1], parameters, out)
+            counts[1] += m * (starts[rule + 1] - starts[rule])
+            for i in range(m):
+                k, total = chosen[i], sums[i]
+                before, earlier = history[0, k], history[1, k]
+                spread, low_sun = math.inf, sine / g[2, k]
+                if shadowed and total > 0.0:
+                    spread = 0.5 * solid * g[2, k] * (most[i] - least[i]) / total
+                elif total > 0.0 and least[i] > 0.0:
+                    spread = 0.5 * math.log(most[i] / least[i])
+                good = not rough and nearness[k] <= reaches[rule]
+                good = good and small(spread, low_sun, degrees[rule], bound, not shadowed)
+                faint = 0.0
+                if total <= 0.01 * floor:
+                    good, faint = good or not rough, floor if total > 0.0 else _UNDERFLOW
+                if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
+                    step = abs(total - before)
+                    estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
+                    good = estimate <= 0.25 * rtol * total
+                    if not good and estimate <= 0.1 * floor:
+                        good, faint = True, floor
+                history[0, k], history[1, k] = total, before
+                if good:
+                    relative = 0.5 * rtol + EPS * (16.0 + 16.0 / width + 4.0 / g[2, k])
+                    value[begin + k] += scale * total
+                    error[begin + k] += scale * (relative * total + faint)
+                    worst = max(worst, relative)
+                elif rule == rules - 1:
+                    left[counts[0]] = begin + k
+                    counts[0] += 1
+                else:
+                    following = rule + 1
+                    while (
+                        not rough
+                        and (spread < _FLAT or (not shadowed and spread < 30.0))
+                        and following < rules - 1
+                        and not small(spread, low_sun, degrees[following], bound, not shadowed)
+                    ):
+                        following += 1
+                    level[k] = following
+    return worst
 
-    return jit.kernel(disks)
+
+_disks = jit.kernel(_all_disks)

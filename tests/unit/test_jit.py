@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import TypingError
 
 from gonio import jit
 
@@ -26,10 +27,26 @@ def build(f):
 value = build(material.model)(np.arange(4.0))
 print(value, jit.compiled_count())
 """
+_BY_ADDRESS = """
+import numpy as np
+from gonio import jit
+from material import model
+def weigh(x):
+    s = 0.0
+    for k in range(x.size):
+        s += model(x[k])
+    return s
+call = jit.calling("float64(float64[::1])")
+@jit.kernel
+def total(at, x):
+    return call(at, x)
+value = total(jit.address(weigh, "float64(float64[::1])"), np.arange(4.0))
+print(value, jit.compiled_count())
+"""
 _MODEL = "from gonio import jit\nFACTOR = {factor}\n@jit.model\ndef model(x):\n    return FACTOR * x + {offset}\n"
 
 
-def _run(folder: Path, factor: float, offset: float, cache: Path) -> tuple[float, int]:
+def _run(folder: Path, factor: float, offset: float, cache: Path, script: str = _SCRIPT) -> tuple[float, int]:
     (folder / "material.py").write_text(_MODEL.format(factor=factor, offset=offset))
     root = Path(jit.__file__).parents[1]
     environment = os.environ | {
@@ -37,7 +54,7 @@ def _run(folder: Path, factor: float, offset: float, cache: Path) -> tuple[float
         "PYTHONPATH": os.pathsep.join((str(folder), str(root))),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     value, compiled = done.stdout.split()
     return float(value), int(compiled)
 
@@ -54,12 +71,50 @@ def test_cache_hits_and_is_never_stale(tmp_path: Path) -> None:
     assert _run(tmp_path, 2.0, 0.0, cache) == (12.0, 1)  # compiles again, does not fail
 
 
+def test_what_a_kernel_calls_by_address_is_cached_like_a_kernel(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    assert _run(tmp_path, 2.0, 0.0, cache, _BY_ADDRESS) == (12.0, 2)
+    assert _run(tmp_path, 2.0, 0.0, cache, _BY_ADDRESS) == (12.0, 0)  # a second process hits
+    assert _run(tmp_path, 3.0, 1.0, cache, _BY_ADDRESS) == (22.0, 1)  # the kernel itself stays as it is
+    for file in (cache / "gonio").iterdir():
+        file.write_bytes(b"damaged")
+    assert _run(tmp_path, 2.0, 0.0, cache, _BY_ADDRESS) == (12.0, 2)
+
+
+def test_arguments_of_another_kind_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory would be read in the wrong order, or a constant written to."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    call = jit.calling("float64(float64[:,::1])")
+
+    @jit.kernel
+    def first(at, x):  # type: ignore[no-untyped-def]
+        return call(at, x)
+
+    @jit.kernel
+    def short(at):  # type: ignore[no-untyped-def]
+        return call(at)
+
+    def corner(x):  # type: ignore[no-untyped-def]
+        return x[0, 0]
+
+    at, x = jit.address(corner, "float64(float64[:,::1])"), np.arange(3.0, 9.0).reshape(2, 3)
+    assert first(at, x) == 3.0
+    constant = x.copy()
+    constant.flags.writeable = False
+    for other in (x.T, x[0], constant):
+        with pytest.raises(TypingError):
+            first(at, other)
+    with pytest.raises(TypingError):
+        short(at)
+
+
 _KEYS = """
 from gonio.brdf import families
-from gonio.integrate import cut_disk, disk, ring_kernel
+from gonio.integrate import cut_disk, disk, grid, quadrature, ring_kernel
 functions = [m.function for m in (f.model() for f in families.FAMILIES.values()) if m.function is not None]
-for build in (disk._kernel, cut_disk._kernel, ring_kernel.ring_kernel):
+for build in (quadrature._compiled_sums, grid._beam, ring_kernel.ring_kernel):
     print(*(build(f).py_func.__qualname__ for f in functions))
+print(*(kernel.py_func.__qualname__ for kernel in (disk._disks, cut_disk._cut_disks)))
 """
 
 
