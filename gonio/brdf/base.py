@@ -111,6 +111,9 @@ class Model:
     kink_power : callable, optional
         Of the parameter array: f_r begins at its kinks as this broken power of the distance; infinite for one so high that
         it is smooth. None: on either side of its kinks f_r is smooth.
+    faint_kinks : callable, optional
+        Of the parameter array: whether f_r next to its kinks is nothing against its largest values, so that only those who
+        ask for the far tail of a lobe need to break there. None: never.
     bent : bool
         A derivative jumps elsewhere too, not at planes: only cells that are halved until they agree will do.
     features : callable, optional
@@ -149,6 +152,7 @@ class Model:
     layer_width: Callable[[Array], float] | None = None
     kinks: Callable[[Array, Array], Array] | None = None
     kink_power: Callable[[Array], float] | None = None
+    faint_kinks: Callable[[Array], bool] | None = None
     bent: bool = False
     features: Callable[[Array, Array], Array] | None = None
     derived: Callable[[Array], Array] | None = None
@@ -245,7 +249,17 @@ class Term:
         """Narrow structures elsewhere than at the mirror: rows of a unit vector and a half width [rad], shape (k, 4)."""
         return np.empty((0, 4)) if self.model.features is None else self.model.features(self.values, omega_r)
 
+    @property
+    def kinked(self) -> bool:
+        """Whether the model has kinks next to which f_r counts."""
+        model = self.model
+        return model.kinks is not None and not (model.faint_kinks is not None and model.faint_kinks(self.values))
+
     def kinks(self, omega_r: Array) -> Array:
+        """`edges` next to which f_r counts, as rules for what is not faint take them."""
+        return self.edges(omega_r) if self.kinked else np.empty((*omega_r.shape[:-1], 0, 4))
+
+    def edges(self, omega_r: Array) -> Array:
         """Planes ``c . w = d`` of the term's kinks for reflected directions (..., 3), shape (..., k, 4); k = 0 without any.
 
         Of a user's own function: for one direction (3,).

@@ -40,7 +40,7 @@ from gonio.brdf.elementary import exp, log_near, two_products
 
 Array = NDArray[np.float64]
 INV_TWO_PI = 0.5 / math.pi
-_SMOOTH = 40.0  # from that exponent on, what lies next to the cut is nothing, even where only the tail is lit
+_FAINT = 40.0  # from that exponent on, what lies next to the cut is nothing against the lobe
 _BROKEN = 8.0  # and a broken power is as good as a polynomial
 
 
@@ -66,9 +66,7 @@ def _width(p: Array) -> float:
 
 
 def _kinks(p: Array, omega_r: Array) -> Array:
-    """The lobe is cut at m.w = 0, with a derivative that jumps where n is small."""
-    if p[1] >= _SMOOTH:
-        return np.empty((*omega_r.shape[:-1], 0, 4))
+    """The lobe is cut at m.w = 0."""
     plane = np.stack((-omega_r[..., 0], -omega_r[..., 1], omega_r[..., 2], np.zeros_like(omega_r[..., 2])), axis=-1)
     return plane[..., None, :]
 
@@ -80,6 +78,10 @@ def cut_power(n: float) -> float:
 
 def _kink_power(p: Array) -> float:
     return cut_power(float(p[1]))
+
+
+def _faint_kinks(p: Array) -> bool:
+    return bool(p[1] >= _FAINT)
 
 
 _N = Parameter("n", 0.0, 1e8, "exponent", ("log_normal", math.log(50.0), 2.0))
@@ -94,6 +96,7 @@ PHONG = Model(
     lobe_width=_width,
     kinks=_kinks,
     kink_power=_kink_power,
+    faint_kinks=_faint_kinks,
     shadowed=False,
 )
 
@@ -137,8 +140,6 @@ def _axis(p: Array, omega_r: Array) -> Array:
 
 
 def _lafortune_kinks(p: Array, omega_r: Array) -> Array:
-    if p[3] >= _SMOOTH:
-        return np.empty((*omega_r.shape[:-1], 0, 4))
     axis = _axis(p, omega_r)
     out_of_reach = np.where(np.any(axis != 0.0, axis=-1), 0.0, 2.0)
     return np.concatenate((axis, out_of_reach[..., None]), axis=-1)[..., None, :]
@@ -146,6 +147,10 @@ def _lafortune_kinks(p: Array, omega_r: Array) -> Array:
 
 def _lafortune_kink_power(p: Array) -> float:
     return cut_power(float(p[3]))
+
+
+def _lafortune_faint_kinks(p: Array) -> bool:
+    return bool(p[3] >= _FAINT)
 
 
 def _lafortune_features(p: Array, omega_r: Array) -> Array:
@@ -169,5 +174,6 @@ LAFORTUNE = Model(
     lobe_width=_lafortune_width,
     kinks=_lafortune_kinks,
     kink_power=_lafortune_kink_power,
+    faint_kinks=_lafortune_faint_kinks,
     features=_lafortune_features,
 )

@@ -26,6 +26,7 @@ from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate import threads
 from gonio.integrate.cells import COLUMNS, MOST_PLANES, NODES, build, fill, place, sums
+from gonio.integrate.tails import UNDERFLOW
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -38,6 +39,8 @@ _SAFETY = 4.0  # a feature that no node has met yet can exceed the difference of
 _GROWTH = 64.0  # of panels away from the horizon; halving sees to the rest
 GRAZING = 0.05  # cosine below which a view is grazing: its lobe is a streak
 _DEEPEST = 2.0**-40  # of a base cell's side
+_ENDS = np.array([1e-9, 0.5, 1.0 - 1e-9])  # of a cell's sides, and their middles
+_GLIMPSE = 1e-290  # f_r times the radiance that is not 0 by underflow
 
 
 class Counter(Protocol):
@@ -252,11 +255,12 @@ class _Block:
             count = np.bincount(element, minlength=n)
             open_ = (missing > tolerance) & (spent * NODES.size**2 < _LARGEST)
             split = open_[element] & (err > 0.5 * tolerance[element] / count[element]) & (err > 100 * EPS * np.abs(value))
+            split |= self._glimpsed((total == 0.0)[element])
             split &= _smallest(self.box) > _DEEPEST
             if not np.any(split):
                 if self.term.model.pieces:
                     total, missing = self._confirm(total)
-                return total, missing + self.rounding * np.abs(total)
+                return total, missing + self.rounding * np.abs(total) + (total == 0.0) * UNDERFLOW
             ways = np.where(along > 4 * across, 1, np.where(across > 4 * along, 2, 3)) * split
             keep = ~split
             base, box = _halve(self.base[split], self.box[split], ways[split])
@@ -264,6 +268,15 @@ class _Block:
             spent += np.bincount(self.owner[base], minlength=n)
             self.base, self.box = np.concatenate((self.base[keep], base)), np.concatenate((self.box[keep], box))
             value, along, across = (np.concatenate((o[keep], f)) for o, f in zip((value, along, across), fresh, strict=True))
+
+    def _glimpsed(self, dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Cells without a value at any node that have one at a corner or a side: a tail that falls too steeply."""
+        index, out = np.flatnonzero(dark), np.zeros(len(dark), dtype=np.bool_)
+        for start in range(0, len(index), _CHUNK):
+            some = index[start : start + _CHUNK]
+            values, weights = self._integrand(self.base[some], self.box[some], _ENDS)
+            out[some] = np.any((values > _GLIMPSE) & (weights > 0.0), axis=(1, 2))
+        return out
 
     def _confirm(self, before: Array) -> tuple[Array, Array]:
         """All cells halved once more, for models with small pieces that both rules of a cell may have missed."""
@@ -277,26 +290,30 @@ class _Block:
     def _evaluate(self, base: Index, box: Array) -> tuple[Array, Array, Array]:
         """Value of each cell, and its errors along t and along chi."""
         out = np.empty((3, len(base)))
-        side = NODES.size
         for start in range(0, len(base), _CHUNK):
             part = slice(start, min(len(base), start + _CHUNK))
-            size = part.stop - start
-            directions, weights = np.empty((size, side, side, 3)), np.empty((size, side, side))
-            fill(self.cells, self.owner, self.circles, self.frames, base[part], box[part], NODES, directions, weights)
-            flat, element = directions.reshape(-1, 3), self.owner[base[part]]
-            f_r, fixed = np.zeros(len(flat)), np.repeat(self.fixed[element], side * side, axis=0)
-            pair = (fixed, flat) if self.reverse else (flat, fixed)
-            accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
-            f_r = f_r.reshape(weights.shape)
-            if self.light is not None:
-                f_r *= self.light.radiance(directions.reshape(size, -1, 3), self.names[element]).reshape(weights.shape)
-            sums(f_r, weights, out[:, part])
-            self.nodes += f_r.size
+            sums(*self._integrand(base[part], box[part], NODES), out[:, part])
         if not np.all(np.isfinite(out)):
             raise ParameterError(
                 f"{self.term.model.name}: f_r or the radiance is NaN or infinite above the horizon; both must be finite"
             )
         return out[0], _SAFETY * np.abs(out[0] - out[1]), _SAFETY * np.abs(out[0] - out[2])
+
+
+    def _integrand(self, base: Index, box: Array, x: Array) -> tuple[Array, Array]:
+        """f_r times the radiance, and the weights, at nodes x by x of each cell, shape (c, k, k)."""
+        size, side = len(base), x.size
+        directions, weights = np.empty((size, side, side, 3)), np.empty((size, side, side))
+        fill(self.cells, self.owner, self.circles, self.frames, base, box, x, directions, weights)
+        flat, element = directions.reshape(-1, 3), self.owner[base]
+        f_r, fixed = np.zeros(len(flat)), np.repeat(self.fixed[element], side * side, axis=0)
+        pair = (fixed, flat) if self.reverse else (flat, fixed)
+        accumulate(self.term.model)(*pair, self.term.values, self.term.weight, f_r)
+        f_r = f_r.reshape(weights.shape)
+        if self.light is not None:
+            f_r *= self.light.radiance(directions.reshape(size, -1, 3), self.names[element]).reshape(weights.shape)
+        self.nodes += f_r.size
+        return f_r, weights
 
 
 def _smallest(box: Array) -> Array:
@@ -326,7 +343,7 @@ def _planes(term: Term, fixed: Array, region: Region, light: Light | None) -> tu
             own.append([[0.0, 0.0, 1.0, math.pi / 2]])
         elif region.half_angle < math.pi:
             own.append([[*region.axis[k], region.half_angle]])
-        kinks = term.kinks(fixed[k])
+        kinks = term.edges(fixed[k])
         kinks = kinks[np.abs(kinks[:, 3]) < 1.0]  # others miss the sphere
         if len(kinks) > MOST_PLANES:
             raise ParameterError(f"{term.model.name}: {len(kinks)} planes of kinks; at most {MOST_PLANES} can be broken at")

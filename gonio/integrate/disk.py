@@ -43,6 +43,7 @@ from gonio.integrate.closed_forms import collimated
 from gonio.integrate.cut_disk import crosses
 from gonio.integrate.grid import BLOCK, Gradients, block
 from gonio.integrate.model_sums import over_nodes, over_rule, sum_over_nodes, sums_over_rule
+from gonio.integrate.tails import POINTS, UNDERFLOW, ceiling, nothing
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
@@ -57,7 +58,6 @@ _FLAT = 0.5  # spread below which the agreement of two rules is none by chance
 _SAFETY = 64.0  # of the bound
 _MARGIN = 1.25  # of 1 / rho, in the bound
 _NOTHING = 1e-60  # of the solid angle: the far tail of a lobe, of which no digits are asked
-_UNDERFLOW = 1e-301  # what is 0 may be as much
 _FAINT = 1e-16  # of the largest value of a map: the same
 _PROBES = 512  # gradients by which that value is known
 
@@ -131,14 +131,13 @@ def add(
     x, w, cuts = _segment_nodes()
     left, crossed = np.empty((2, tile[1] - tile[0]), dtype=np.int64)
     counts = np.zeros(3, dtype=np.int64)
-    kinked = term.model.kinks is not None
-    planes = term.kinks(gradients.elements(*tile).viewer()) if kinked else np.empty((0, 0, 4))
-    function = term.model.function
+    planes = term.kinks(gradients.elements(*tile).viewer()) if term.kinked else np.empty((0, 0, 4))
+    function, rough = term.model.function, term.model.kinks is not None or term.model.pieces
     worst = _disks(
         gradients.p, gradients.q, *tile, np.array(cap.axis), cap.half_angle, cap.radiance * term.weight,
         term.lobe_width() or 10.0, term.layer_width(), over_nodes(function), over_rule(function), term.values, nodes, starts,
-        np.array(_DEGREES), _reaches(rtol), x, w, cuts, planes, kinked or term.model.pieces, term.model.shadowed, rtol,
-        floor, value, error, left, crossed, counts,
+        np.array(_DEGREES), _reaches(rtol), x, w, cuts, planes, rough, term.model.shadowed, rtol, floor, value,
+        error, left, crossed, counts,
     )  # fmt: skip
     rest, nodes_used = left[: counts[0]].astype(np.intp), int(counts[1])
     if counts[2]:
@@ -150,15 +149,19 @@ def add(
     return float(worst), nodes_used, rest
 
 
-def negligible(term: Term, cap: Cap, gradients: Gradients) -> float:
-    """What of the integral of f_r cos theta_i [1] is nothing, next to the largest of many gradients or by itself."""
+def negligible(term: Term, cap: Cap, gradients: Gradients) -> tuple[float, bool]:
+    """What of the integral of f_r cos theta_i [1] is nothing, and whether by the largest of many gradients.
+
+    Otherwise it is nothing by itself, and counts where no gradient is brighter.
+    """
     solid = math.pi * math.sin(cap.half_angle) ** 2
     if gradients.size < _PROBES:
-        return _NOTHING * solid
+        return _NOTHING * solid, False
     some = gradients.select(np.arange(0, gradients.size, gradients.size // _PROBES)).elements()
     brightest, _ = collimated(term, Collimated(cap.axis, 1.0), some)
     # a disk wider than the lobe gets less than that, and no surface reflects more than all
-    return max(_NOTHING * solid, _FAINT * min(solid * float(np.max(brightest)), abs(term.weight)))
+    faint = _FAINT * min(solid * float(np.max(brightest)), abs(term.weight))
+    return max(_NOTHING * solid, faint), faint > _NOTHING * solid
 
 
 @functools.cache
@@ -264,16 +267,20 @@ def _segment_rule(  # type: ignore[no-untyped-def]
             at += m
         total = sum_over_nodes(weigh, some, at, s, c, parameters)
         counts[1] += at
-        if total <= 0.01 * floor:
-            return total, floor if total > 0.0 else _UNDERFLOW
+        dim = total <= 0.01 * floor
+        if dim:
+            sine, cosine = math.sin(half_angle), math.cos(half_angle)
+            tail = ceiling(weigh, ax, ay, az, s, c, sine, cosine, POINTS, some, parameters)
+            if nothing(tail, math.pi * sine * sine, floor):
+                return total, floor if tail > 0.0 else UNDERFLOW
         if before >= 0.0:
             step = abs(total - before)
             estimate = 2.0 * step
             if earlier >= 0.0:
                 estimate = max(step, 0.01 * abs(before - earlier))
-            if estimate <= 0.25 * rtol * total:
+            if total > 0.0 and estimate <= 0.25 * rtol * total:
                 return total, 0.0
-            if estimate <= 0.1 * floor:
+            if not dim and estimate <= 0.1 * floor:
                 return total, floor
         earlier, before = before, total
     return -1.0, 0.0
@@ -378,14 +385,17 @@ def _all_disks(  # type: ignore[no-untyped-def]
                     spread = 0.5 * math.log(most[i] / least[i])
                 good = not rough and nearness[k] <= reaches[rule]
                 good = good and small(spread, low_sun, degrees[rule], bound, not shadowed)
-                faint = 0.0
-                if total <= 0.01 * floor:
-                    good, faint = good or not rough, floor if total > 0.0 else _UNDERFLOW
+                faint, dim = 0.0, total <= 0.01 * floor
+                if dim and not good:
+                    ax, ay, az, s, c = g[0, k], g[1, k], g[2, k], g[9, k], g[10, k]
+                    points = POINTS if shadowed else 1
+                    tail = ceiling(weigh, ax, ay, az, s, c, sine, cosine, points, flat, parameters)
+                    good, faint = nothing(tail, solid, floor), floor if tail > 0.0 else UNDERFLOW
                 if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
                     step = abs(total - before)
                     estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))
-                    good = estimate <= 0.25 * rtol * total
-                    if not good and estimate <= 0.1 * floor:
+                    good, faint = total > 0.0 and estimate <= 0.25 * rtol * total, 0.0
+                    if not good and not dim and estimate <= 0.1 * floor:
                         good, faint = True, floor
                 history[0, k], history[1, k] = total, before
                 if good:

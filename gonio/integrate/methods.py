@@ -17,8 +17,9 @@ from gonio.integrate.grid import Gradients, add_beam
 from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
-from gonio.integrate.results import ROUNDING
+from gonio.integrate.results import NOTHING, ROUNDING
 from gonio.integrate.ring_patches import Room
+from gonio.integrate.ring_scene import Scene
 from gonio.integrate.ring_table import tabulate
 from gonio.integrate.rings import integrate_rings, scene_of, slopes_are_few
 from gonio.source import Cap, Collimated
@@ -32,6 +33,8 @@ _FEW_CELLS, _FEW_WAVES = 1 << 10, 256  # so many cells cost a gradient less than
 _AT_LEAST, _PER_LOBE = 100, 20  # cells that one gradient takes
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
 _SAMPLE_OF_TREE = 0.015
+_MANY_SLOPES = 4096  # gradients from which on a table is worth what it takes
+_TRIED = 8  # slopes that tell what one takes
 _MANY = 1 << 19  # gradients from which on a quadtree pays
 
 
@@ -97,15 +100,23 @@ class Run:
 
     def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
         """Most gradients by rules for small disks, the others by the general rule."""
-        floor = disk.negligible(step.term, cap, self.gradients)
+        floor, known = disk.negligible(step.term, cap, self.gradients)
+        v, e = (value, error) if known else (np.zeros_like(value), np.zeros_like(error))
         done = tiling.run(
-            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, floor, value, error),
+            lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, floor, v, e),
             self.gradients.tiles(),
             threads,
         )
         step.effort.add(sum(nodes for _, nodes, _ in done), 1)
         worst = max((relative for relative, _, _ in done), default=0.0)
         left = np.concatenate([index for _, _, index in done]) if done else np.empty(0, dtype=np.intp)
+        if not known:  # what is faint counts if nothing is brighter
+            largest = float(np.max(np.abs(value + v), initial=0.0))
+            faint = np.flatnonzero((e > self.rtol * np.abs(v)) & (e > max(ROUNDING * largest, self.atol, NOTHING)))
+            v[faint] = e[faint] = 0.0
+            left = np.union1d(left, faint)
+            value += v
+            error += e
         if left.size:
             v, e = self._by_element(step, self.gradients.select(left).elements(), threads)
             value[left] += v
@@ -154,18 +165,20 @@ class Run:
         grid, rtol = self.gradients, self.rtol
         most = max(_FEW, int(_CELLS / _cells_of(field)))  # for cells
         handful = most > _FEW and grid.size <= _HANDFUL
-        if handful or slopes_are_few(grid):
+        scene = scene_of(step.term, field, rtol, step.effort, threads)
+        table = None
+        if not (handful or slopes_are_few(grid)):
+            room = Room(grid, rtol, self.atol, value, error, threads)
+            table = tabulate(scene, rtol, room, self._worth(scene))
+        if table is None:
             elements, spare = grid.elements(), self._spare(value, error)
             if handful:
                 v, e = self._cells(step, field, elements, spare, threads)
             else:
-                v, e = self._slopes(step, field, elements, spare, most, threads)
+                v, e = self._slopes(step, scene, field, elements, spare, most, threads)
             value += v
             error += e
             return _largest(e, value, ROUNDING * np.max(np.abs(value), initial=0.0))
-        scene = scene_of(step.term, field, rtol, step.effort, threads)
-        room = Room(grid, rtol, self.atol, value, error, threads)
-        table = tabulate(scene, rtol, room)
         negligible = ROUNDING * max(room.largest, table.largest)
 
         def add(tile: tuple[int, int]) -> tuple[float, NDArray[np.intp]]:
@@ -186,11 +199,19 @@ class Run:
         error[missed] += e
         return max(worst, _largest(error[missed], value[missed], negligible))
 
+    def _worth(self, scene: Scene) -> float:
+        """Evaluations that a table may take: with some hundreds of gradients, as many as slope by slope."""
+        grid = self.gradients
+        if grid.size > _MANY_SLOPES:
+            return math.inf
+        begun, some = scene.effort.evaluations, np.linspace(0, grid.size - 1, _TRIED).astype(np.intp)
+        integrate_rings(scene, grid.select(some).elements(), rtol=self.rtol, atol=self.atol)
+        return (scene.effort.evaluations - begun) * grid.size / _TRIED
+
     def _slopes(
-        self, step: Step, field: Field, elements: Elements, spare: Array, most: int, threads: int
+        self, step: Step, scene: Scene, field: Field, elements: Elements, spare: Array, most: int, threads: int
     ) -> tuple[Array, Array]:
         """Rings slope by slope; up to `most` that they leave above their tolerance by cells."""
-        scene = scene_of(step.term, field, self.rtol, step.effort, threads)
         waves = _FEW_WAVES if len(elements) <= most and _cells_of(field) <= _FEW_CELLS else 1 << 20
         v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare, most_waves=waves)
         missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))

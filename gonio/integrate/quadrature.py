@@ -25,6 +25,7 @@ from gonio.integrate.adaptive import edge_rounding
 from gonio.integrate.cap import NO_LAYER, NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.integrate.lights import over_cap
+from gonio.integrate.tails import UNDERFLOW, upper_bound
 from gonio.source import Cap
 
 Array = NDArray[np.float64]
@@ -143,10 +144,12 @@ def integrate_cap(
         error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
         if np.all(done):
             break
-    missed = ~done
+    missed, blind = ~done, _blind(scene, lit & ~crossed & (value == 0.0), error)
     if not kinked:  # a few that no order suits, such as of tables, whose pieces have borders that are not known
         missed &= unit * np.abs(value) < 0.1 * np.maximum(rtol * np.abs(value), atol)
         missed &= cautious and np.count_nonzero(missed) <= _FEW
+    if cautious and np.count_nonzero(blind) <= _FEW:
+        missed |= blind
     rest = np.flatnonzero(crossed | missed)
     if rest.size:
         local = about_normal is not False
@@ -158,10 +161,21 @@ def integrate_cap(
     return value, error
 
 
+def _blind(scene: _Scene, none: NDArray[np.bool_], error: Array) -> NDArray[np.bool_]:
+    """Of the elements `none`, with a value of 0, those whose nodes all missed a lobe's tail; sets the errors of all."""
+    index = np.flatnonzero(none)
+    blind = np.zeros(len(none), dtype=np.bool_)
+    if index.size:
+        bound = upper_bound(scene.term, scene.axis[index], scene.cap.half_angle, scene.cos_n[index], scene.sin_n[index])
+        error[index] = abs(scene.cap.radiance * scene.term.weight) * np.maximum(bound, UNDERFLOW)
+        blind[index] = bound > 0.0
+    return blind
+
+
 def _scene(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) -> _Scene:
     axis = np.ascontiguousarray(elements.local(cap.axis))
     n, width = len(elements), term.lobe_width() or _NO_LOBE
-    if term.model.kinks is None:
+    if not term.kinked:
         planes = np.empty((n, 0, 4))
     else:
         each = [term.kinks(viewer) for viewer in elements.viewer()]

@@ -14,6 +14,7 @@ from gonio.integrate.plan import Step
 
 Array = NDArray[np.float64]
 ROUNDING = 1e-13  # of the largest value of a map: errors below it are met by any tolerance
+NOTHING = 1e-250  # [W m^-2 sr^-1], the same: where numbers underflow
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def _judge(value, error, rtol, atol):  # type: ignore[no-untyped-def]
     missed, worst = 0, 0.0
     for k in range(value.size):
         size = abs(value[k])
-        if error[k] > max(rtol * size, atol) * (1.0 + 1e-9) + 1e-300 and error[k] > ROUNDING * largest:
+        if error[k] > max(rtol * size, atol) * (1.0 + 1e-9) + NOTHING and error[k] > ROUNDING * largest:
             missed += 1
         if size > 0.0 and error[k] > worst * size:
             worst = error[k] / size

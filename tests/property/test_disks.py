@@ -14,6 +14,8 @@ from gonio.brdf.base import BRDF
 from gonio.geometry import normal_from_gradient
 from gonio.integrate import disk, scene_radiance
 from gonio.source import Cap
+from tests import problems
+from tests.independent import reflected_radiance
 
 make_brdf, make_source = gonio.brdf.make, gonio.source.make
 
@@ -104,3 +106,58 @@ def test_disks_are_honest_at_random(seed: int) -> None:
             assert off[worst] <= 0.0, (brdf, cap, float(p[worst]), float(q[worst]), got.value[worst], got.error[worst], rtol)
             checked += len(p)
     assert checked == 3 * 6 * 45
+
+
+# --- tails --------------------------------------------------------------------------------------------------------------
+
+
+def _off_the_lobe(rng: np.random.Generator, tilt: float, away: float, half_angle: float) -> dict[str, object]:
+    """A disk whose centre is `away` from the direction that a surface of that tilt towards +x mirrors."""
+    c, s, chi = math.cos(2 * tilt), math.sin(2 * tilt), rng.uniform(0, 2 * math.pi)
+    mirror, across = np.array([s, 0.0, c]), np.array([c, 0.0, -s])
+    aside = math.cos(chi) * across + math.sin(chi) * np.array([0.0, 1.0, 0.0])
+    x, y, z = math.cos(away) * mirror + math.sin(away) * aside
+    return {"kind": "disk", "theta": math.acos(z), "phi": math.atan2(y, x), "half_angle": half_angle, "radiance": 1.0}
+
+
+def _lobes(rng: np.random.Generator, kinds: int) -> dict[str, object]:
+    n = 10 ** rng.uniform(0, 4)
+    leaning = {"C_xy": rng.uniform(-1, 1), "C_z": rng.uniform(0.2, 1)}
+    models: list[dict[str, object]] = [{"model": "phong"}, {"model": "blinn_phong"}, {"model": "lafortune", **leaning}]
+    return {"k_s": 1.0, "n": n, **models[rng.integers(kinds)]}
+
+
+@pytest.mark.parametrize("others", [0, 3, 600])
+def test_where_only_the_tail_of_a_lobe_is_lit(others: int) -> None:
+    """Rationale: nodes meet nothing, or next to nothing, of a lobe of a high power whose cut, a right angle away, is there.
+
+    The value is good to the tolerance, however small, or nothing next to the brightest of many gradients; the error is
+    never below what is missing. Against the independent evaluation, down to what underflows.
+    """
+    rng = np.random.default_rng([21, others])
+    faint = 0
+    for k in range(100 if others < 600 else 40):
+        term, rtol, tilt = _lobes(rng, 3 if others < 600 else 2), (1e-3, 1e-6, 1e-9)[k % 3], rng.uniform(0, 1.5)
+        half_angle = 10 ** rng.uniform(-3, -0.46) if k % 4 else rng.uniform(0.35, 1.2)
+        away = (math.pi / 2 if k % 2 else rng.uniform(0.3, 2.0)) + half_angle * rng.uniform(-1.05, 1.0)
+        part = _off_the_lobe(rng, tilt, away, half_angle)
+        p, q = rng.normal(scale=1.5, size=(2, 1 + others))
+        p[0], q[0] = -math.tan(tilt), 0.0
+        p[1:4], q[1:4] = p[0] + 0.02 * p[1:4], 0.02 * q[1:4]
+        got = gonio.reflectance_map(problems.make_brdf([term]), problems.make_source([part]), p, q, rtol=rtol)
+        for j in range(min(len(p), 4)):
+            scene, value, error = {"brdf": [term], "source": [part], "p": p[j], "q": q[j]}, got.value[j], got.error[j]
+            truth = reflected_radiance(scene, "normal", 1e-11)
+            assert abs(value - truth) <= error + 1e-10 * truth + 1e-290, (scene, value, error, truth)
+            assert error <= max(rtol * value, 1e-13 * np.max(got.value), 1e-250), (scene, value, error)
+            faint += 0.0 < truth < 1e-40
+    assert faint > 10
+
+
+def test_a_disk_beyond_the_cut_or_below_the_horizon_gives_nothing() -> None:
+    for n in (3.0, 46.54, 1e4):
+        lobe = make_brdf("phong", k_s=1.0, n=n)
+        for theta, p in ((math.radians(95.0), 0.0), (0.3, -math.tan(math.radians(80.0)))):  # set; 143 degrees off the lobe
+            sun = make_source("disk", theta=theta, phi=0.0, half_angle=0.05, radiance=1.0)
+            got = gonio.reflectance_map(lobe, sun, p, 0.0)
+            assert float(got.value) == 0.0 and float(got.error) <= 1e-250
