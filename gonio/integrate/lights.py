@@ -21,8 +21,9 @@ _BROAD = 0.1  # width of a lobe [rad]
 
 
 def over_cap(
-    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool, effort: Counter
-) -> tuple[Array, Array]:
+    term: Term, cap: Cap, elements: Elements, *, rtol: float, atol: float, about_normal: bool, effort: Counter,
+    threads: int = 1,
+) -> tuple[Array, Array]:  # fmt: skip
     """Reflected radiance of each element due to one term and one cap: `integrate` with the cap's radiance."""
     axis, profile = elements.local(cap.axis), cap.profile
 
@@ -32,7 +33,8 @@ def over_cap(
         return np.asarray(cap.radiance * profile(np.einsum("ikj,ij->ik", directions, axis[element])))
 
     region = Region(axis, cap.half_angle, about_normal)
-    return integrate(term, elements.viewer(), region, Light(radiance), rtol=rtol, atol=atol, effort=effort)
+    cores = 1 if term.model.own else threads  # who knows what a user's function can stand
+    return integrate(term, elements.viewer(), region, Light(radiance), rtol=rtol, atol=atol, effort=effort, cores=cores)
 
 
 def over_field(

@@ -26,6 +26,7 @@ from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
 _FEW = 64  # gradients up to which a table in theta_n does not pay
+_FEW_BY_CELLS = 512  # where cells are the rule, which take their time for each of a table's nodes, too
 _MOST_BESIDE = 256  # gradients that are done one by one where a table in theta_n falls short
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
 _CELLS = 1 << 20  # with which gradients may be done that rings leave above their tolerance: seconds
@@ -75,7 +76,8 @@ class Run:
             if step is not together[0]:
                 return together[0].error
             return self._tree(together, step.part, count, value, error)
-        if step.method is Method.RADIAL and isinstance(step.part, Cap) and self.gradients.size > _FEW:
+        few = _FEW if step.term.mirror_only else _FEW_BY_CELLS
+        if step.method is Method.RADIAL and isinstance(step.part, Cap) and self.gradients.size > few:
             return self._radial(step, step.part, count, value, error)
         if step.method is Method.RINGS and isinstance(step.part, Field):
             return self._rings(step, step.part, count, value, error)

@@ -38,7 +38,7 @@ _LIMB = 1e-150  # least cosine of the view: an infinite slope gives the limit
 _TILE = 1 << 14  # nodes evaluated at once: they stay in the cache
 _WORTH = 1 << 15  # nodes below which several threads gain nothing
 _LARGEST = 1 << 24  # nodes for one surface element: 640 MiB
-_FEW = 64  # surface elements up to which cells are tried where no order suits
+_FEW = 256  # surface elements up to which cells are tried where no order suits
 _NARROW = 0.6  # half angle [rad] up to which a cap may be integrated about its own axis
 _BROAD = 0.5  # lobe width [rad] from which a lobe does not matter for that choice
 
@@ -115,7 +115,9 @@ def integrate_cap(
     """
     if term.model.own or not term.mirror_only:
         local = cap.half_angle > _NARROW if about_normal is None else about_normal
-        return over_cap(term, cap, elements, rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort)
+        return over_cap(
+            term, cap, elements, rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort, threads=threads
+        )
     scene = _scene(term, cap, elements, about_normal)
     n = len(elements)
     value, error = np.zeros(n), np.zeros(n)
@@ -154,8 +156,9 @@ def integrate_cap(
     if rest.size:
         local = about_normal is not False
         by_cells, left = over_cap(
-            term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort
-        )
+            term, cap, elements.select(rest), rtol=0.3 * rtol, atol=0.3 * atol, about_normal=local, effort=effort,
+            threads=threads,
+        )  # fmt: skip
         better = crossed[rest] | (left < error[rest])
         value[rest[better]], error[rest[better]] = by_cells[better], left[better]
     return value, error
