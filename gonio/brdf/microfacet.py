@@ -125,6 +125,11 @@ def _kinks(p: Array, omega_r: Array) -> Array:
     return planes
 
 
+def _layer(p: Array) -> float:
+    """What is lost at the first time goes with mu_i ln mu_i at the horizon; below this height its integral is nothing."""
+    return 0.01 * float(p[1])
+
+
 @functools.cache
 def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: str, name: str = "microfacet") -> Model:
     """The model of a set of choices."""
@@ -173,6 +178,7 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
             ) if text
         ),
         lobe_width=lambda p: facets.width(p[1 : 1 + shape]),
+        layer_width=_layer if repeated else None,
         kinks=_kinks if shadowing == "v_groove" else None,
         bent=shadowing == "v_groove",
         derived=derived if facets.count or repeated else None,

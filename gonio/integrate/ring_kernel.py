@@ -23,9 +23,9 @@ from gonio import jit
 from gonio.integrate.ring_nodes import (
     CAPACITY,
     LANES,
-    LARGEST_ORDER,
     RING,
     finest_detail,
+    parts,
     ring_nodes,
     root,
     tangents,
@@ -106,10 +106,9 @@ def ring_kernel(function: Callable[..., float]) -> Any:
                     bend += GAUSSIAN * math.sqrt(digits) * panels_across
                     beyond = max(beyond, 0.5 * (SERIES * digits * digits * min(1.0, panels_across)) ** (1.0 / 3.0))
                 order, starts, ends = theta_order(
-                    a, b, touch, touching, theta_n, width, layer, peaks[slope], bend, beyond, digits
+                    a, b, touch, touching, theta_n, width, layer, peaks[slope], beyond, digits
                 )
-                pieces = max(1, math.ceil(order / LARGEST_ORDER))
-                q = min(LARGEST_ORDER, max(2, math.ceil(order / pieces)))
+                pieces, q = parts(bend, order)
                 start = q * (q - 1) // 2
                 for i in range(q * pieces):
                     x, w = (i // q + x_table[start + i % q]) / pieces, w_table[start + i % q] / pieces

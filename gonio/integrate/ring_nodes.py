@@ -225,10 +225,23 @@ def turn_of(a, b, sn, cn, planes):  # type: ignore[no-untyped-def]
 
 
 @jit.part
-def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: ignore[no-untyped-def]
+def parts(bend, beyond):  # type: ignore[no-untyped-def]
+    """Into how many equal parts an interval is cut, each with an order q of at most 96, and q.
+
+    The interval as a whole would take ``bend + beyond`` nodes. Of the former each part takes its share; what series have
+    beyond their degrees goes with the cube root of a length (`_rest` of `spectrum`), and no other order falls less.
+    """
+    count, order = 1, bend + beyond
+    while order > LARGEST_ORDER:
+        count = max(count + 1, math.ceil(bend / LARGEST_ORDER))
+        order = bend / count + beyond * count ** (-1.0 / 3.0)
+    return count, max(2, math.ceil(order))
+
+
+@jit.part
+def _arc(x_table, w_table, a, b, bend, beyond, scale, nodes, weights, n):  # type: ignore[no-untyped-def]
     """Append the nodes of an arc [a, b], in as many pieces as the largest order asks for; returns how many nodes."""
-    pieces = max(1, math.ceil(order / LARGEST_ORDER))
-    q = min(LARGEST_ORDER, max(2, math.ceil(order / pieces)))
+    pieces, q = parts(bend, beyond)
     start = q * (q - 1) // 2
     h = (b - a) / pieces
     for piece in range(pieces):
@@ -242,10 +255,10 @@ def _arc(x_table, w_table, a, b, order, scale, nodes, weights, n):  # type: igno
 
 
 @jit.part
-def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, bend, rest, digits):  # type: ignore[no-untyped-def]
-    """Order for a panel of theta, and whether it starts and whether it ends with a square root.
+def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, rest, digits):  # type: ignore[no-untyped-def]
+    """Order for a panel of theta besides what oscillates, and whether it starts and whether it ends with a square root.
 
-    Besides the BRDF's own: ``bend`` nodes for the degrees of what oscillates, ``rest`` for what its series have beyond.
+    ``rest`` nodes are for what the series of that have beyond their degrees.
     """
     starts, ends, square_roots = False, False, 1e9
     for k in range(touching):
@@ -264,8 +277,8 @@ def theta_order(a, b, touch, touching, theta_n, width, layer, peaks, bend, rest,
         stretch = min(stretch, _stretch(a, b, peaks[k, 0], peaks[k, 2]))
     order = max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest)
     if starts or ends:
-        return bend + 2.0 * order + 2.0, starts, ends
-    return bend + max(order, _order(square_roots, digits - 3.0)) + 0.5, False, False
+        return 2.0 * order + 2.0, starts, ends
+    return max(order, _order(square_roots, digits - 3.0)) + 0.5, False, False
 
 
 @jit.part
@@ -335,8 +348,8 @@ def ring_nodes(cuts, t, st, ct, sn, cn, theta_n, width, layer, peaks, planes, co
         to_lobe, to_edge = math.sqrt(b * b + pole * pole), math.sqrt((reach - b) ** 2 + edge * edge)
         stretch = min(stretch, (from_lobe + to_lobe) / (b - a), (from_edge + to_edge) / (b - a))
         stretch = min(stretch, math.sqrt((b - a) ** 2 + 4.0 * opposite**2) / (b - a))
-        order = bend * (b - a) + max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest * root(b - a)) + 0.5
-        count = _arc(x_table, w_table, a, b, order, scale, nodes, weights, count)
+        beyond = max(_order(stretch, digits), _SMOOTH * digits * (b - a), rest * root(b - a)) + 0.5
+        count = _arc(x_table, w_table, a, b, bend * (b - a), beyond, scale, nodes, weights, count)
         if b == stop:
             passed = b
         a, from_lobe, from_edge = b, to_lobe, to_edge

@@ -51,7 +51,7 @@ class Scene:
         out = np.zeros((len(tau), 3, waves))
         x, w = gauss_table()
         kernel: Any = ring_kernel(self.term.model.function)
-        needed = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1)
+        needed = self.rings.needed(digits, 2 if self.width >= NONE and self.term.model.diffuse else 1, waves)
         corner = self._corner(digits)
         edges, detail = (self.rings.breaks, np.zeros(1)) if self.rows else self.rings.groups
 

@@ -28,6 +28,7 @@ _TO_LIMB = 4.0  # by which a piece may come nearer to the limb than it began
 _WAVES_IN_PIECE = 8.0  # length of a piece times waves
 _NOISE = 0.1  # of the tolerance, for the quadrature
 _DOUBT = 0.03  # of the digits asked for, which sums may miss alike
+_NOISE_IN_TAIL = 1.5  # times the tail by sums with another digit: it is noise, not waves
 _SOME = [1, 2]  # probes of which the noise is measured
 _FLOORS = 2.5  # of the error that no digits lower: what may be asked for
 _PATCHING = 0.05  # of the tolerance, for reading between the nodes
@@ -66,6 +67,7 @@ class _Trial:
     digits_short: float
     waves_short: bool
     too_long: bool
+    stuck: bool  # by waves that the field's series does not have, or rounding
 
 
 def tabulate(scene: Scene, rtol: float, room: Room, worth: float = math.inf) -> Table | None:
@@ -105,7 +107,7 @@ def tabulate(scene: Scene, rtol: float, room: Room, worth: float = math.inf) -> 
             rate = min(1.0, trial.error / piece.error) if piece.halved else 0.0
             halvings = math.log(trial.error / trial.allowed) / -math.log(rate) if 0.0 < rate < 0.95 else math.inf * rate
             exhausted = exhausted or (trial.too_long and piece.halved > 1 and 2.0 ** min(halvings, 99.0) > _MOST_PIECES)
-            if trial.good or exhausted:
+            if trial.good or trial.stuck or exhausted:
                 done.append((piece, trial))
                 continue
             better = replace(
@@ -158,6 +160,9 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
         smallest = min(float(np.abs(exact).min()), float(np.abs(on_azimuths(nodal, columns)).min()))
         allowed = max(0.7 * rtol * smallest, room.smallest(piece.lower, piece.upper), _FLOORS * floor, resolution)
         noise = max(noise, cut, 0.3 * doubt)
+        lasting = waves == scene.rings.waves and floor + tail > (1.0 - _PATCHING) * allowed
+        if lasting and float(np.max(tail_of(all_rough[k], scene.rings))) > _NOISE_IN_TAIL * tail:
+            noise = max(noise, tail)
         noisy = noise > _NOISE * allowed and digits < MOST_DIGITS
         trials.append(
             _Trial(
@@ -168,6 +173,7 @@ def _try(scene: Scene, pieces: list[_Piece], rtol: float, room: Room, resolution
                 max(1.0, min(3.0, math.ceil(math.log10(3.0 * noise / allowed)))) if noisy else 0.0,
                 lost + tail > 0.2 * allowed and waves < scene.rings.waves,
                 missed > 4.0 * max(noise, lost),
+                lasting and not noisy,
             )
         )
     return trials

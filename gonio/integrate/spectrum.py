@@ -99,8 +99,8 @@ class Spectrum:
         return np.append(self.breaks[first], self.breaks[-1]), 1.0 / np.minimum.reduceat(lengths, first)
 
     @functools.lru_cache(maxsize=8)  # noqa: B019 - spectra are few, and kept by `spectrum` anyway
-    def needed(self, digits: float, power: int) -> Needed:
-        """What sums to so many digits take of it; integrals over rings that are cut fall as m^-power."""
+    def needed(self, digits: float, power: int, waves: int) -> Needed:
+        """What sums of so many waves to so many digits take; integrals over rings that are cut fall as m^-power."""
         nats = digits * math.log(10.0)
         total = self.size.sum(axis=1)
         negligible = 0.03 * 10.0**-digits * total
@@ -110,7 +110,7 @@ class Spectrum:
         bent = (remaining_weak > 100.0 * negligible[:, None]).sum(axis=1)
         cut = np.where(used < self.waves, remaining[np.arange(len(used)), np.minimum(used, self.waves - 1)], 0.0)
         relative = 1.0 / np.maximum(total, 1e-300)[:, None]
-        rest = [_rest(relative * r, n, nats) for r, n in ((remaining, used), (remaining_weak, bent))]
+        rest = [_rest(relative * r, np.minimum(n, waves), nats) for r, n in ((remaining, used), (remaining_weak, bent))]
         return Needed(used.astype(np.int64), bent.astype(np.int64), np.array(rest), cut)
 
 
@@ -120,12 +120,13 @@ def _rest(remaining: Array, count: NDArray[np.intp], nats: float) -> Array:
     The series of wave m on an interval of length l has died to d natural digits at the degree 2 q = z + (d^2 z)^(1/3),
     z = m l / 2, where Bessel's J has; a wave that is weak needs fewer digits.
     """
-    m = np.unique(np.geomspace(1, max(1, remaining.shape[1] - 1), 24).astype(np.intp))
+    last = np.maximum(count - 1, 0)[:, None]
+    share = np.geomspace(1.0 / remaining.shape[1], 1.0, 24)
+    m = (np.concatenate((share, 1.0 - share)) * last).astype(np.intp)  # some, denser towards either end (panels, waves)
+    digits = np.clip(nats + np.log(np.maximum(np.take_along_axis(remaining, m, axis=1), 1e-300)), 0.0, nats)
     length = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
-    digits = np.clip(nats + np.log(np.maximum(remaining[:, m], 1e-300)), 0.0, nats)
-    digits[m >= count[:, None]] = 0.0
-    z = 0.5 * np.minimum(m, np.maximum(count - 1, 0)[:, None])[..., None] * length  # (panels, waves, lengths)
-    beyond = z + np.cbrt(digits[..., None] ** 2 * z) - 0.5 * np.maximum(count - 1, 0)[:, None, None] * length
+    z = 0.5 * m[..., None] * length  # (panels, waves, lengths)
+    beyond = z + np.cbrt(digits[..., None] ** 2 * z) - 0.5 * last[..., None] * length
     rest: Array = 0.5 * np.max(beyond / np.cbrt(length), axis=(1, 2), initial=0.0)
     return rest
 
