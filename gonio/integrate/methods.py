@@ -31,10 +31,10 @@ _MOST_BESIDE = 256  # gradients that are done one by one where a table in theta_
 _HANDFUL = 8  # gradients up to which cells are as fast as rings
 _CELLS = 1 << 20  # with which gradients may be done that rings leave above their tolerance: seconds
 _FEW_CELLS, _FEW_WAVES = 1 << 10, 256  # so many cells cost a gradient less than twice as many waves
-_AT_LEAST, _PER_LOBE = 100, 20  # cells that one gradient takes
+_AT_LEAST, _PER_LOBE, _PER_CELL = 100, 20, 225  # cells that one gradient takes; their nodes
 _SAMPLE = 0.125  # of the tolerance: that of a table's samples
 _SAMPLE_OF_TREE = 0.015
-_MANY_SLOPES = 4096  # gradients from which on a table is worth what it takes
+_MANY_SLOPES = 1024  # gradients from which on a table is worth what it takes
 _TRIED = 8  # slopes that tell what one takes
 _MANY = 1 << 19  # gradients from which on a quadtree pays
 
@@ -171,7 +171,7 @@ class Run:
         table = None
         if not (handful or slopes_are_few(grid)):
             room = Room(grid, rtol, self.atol, value, error, threads)
-            table = tabulate(scene, rtol, room, self._worth(scene))
+            table = tabulate(scene, rtol, room, self._worth(scene, field, most))
         if table is None:
             elements, spare = grid.elements(), self._spare(value, error)
             if handful:
@@ -201,21 +201,26 @@ class Run:
         error[missed] += e
         return max(worst, _largest(error[missed], value[missed], negligible))
 
-    def _worth(self, scene: Scene) -> float:
-        """Evaluations that a table may take: with some hundreds of gradients, as many as slope by slope."""
+    def _worth(self, scene: Scene, field: Field, most: int) -> float:
+        """Evaluations that a table may take: with some hundreds of gradients, as many as slope by slope and by cells."""
         grid = self.gradients
         if grid.size > _MANY_SLOPES:
             return math.inf
         begun, some = scene.effort.evaluations, np.linspace(0, grid.size - 1, _TRIED).astype(np.intp)
-        integrate_rings(scene, grid.select(some).elements(), rtol=self.rtol, atol=self.atol)
-        return (scene.effort.evaluations - begun) * grid.size / _TRIED
+        waves = self._waves(field, most)
+        v, e = integrate_rings(scene, grid.select(some).elements(), rtol=self.rtol, atol=self.atol, most_waves=waves)
+        missed = np.count_nonzero(e > np.maximum(self.rtol * np.abs(v), self.atol)) if grid.size <= most else 0
+        return (scene.effort.evaluations - begun + missed * _PER_CELL * _cells_of(field)) * grid.size / _TRIED
+
+    def _waves(self, field: Field, most: int) -> int:
+        """Up to which rings go slope by slope, where cells may take over."""
+        return _FEW_WAVES if self.gradients.size <= most and _cells_of(field) <= _FEW_CELLS else 1 << 20
 
     def _slopes(
         self, step: Step, scene: Scene, field: Field, elements: Elements, spare: Array, most: int, threads: int
     ) -> tuple[Array, Array]:
         """Rings slope by slope; up to `most` that they leave above their tolerance by cells."""
-        waves = _FEW_WAVES if len(elements) <= most and _cells_of(field) <= _FEW_CELLS else 1 << 20
-        v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare, most_waves=waves)
+        v, e = integrate_rings(scene, elements, rtol=self.rtol, atol=spare, most_waves=self._waves(field, most))
         missed = np.flatnonzero(e > np.maximum(self.rtol * np.abs(v), spare))
         if 0 < missed.size <= most:
             v[missed], e[missed] = self._better(

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _DEGREE = 15
 _SAFETY = 3.0
 _MOST_PIECES = 200
-_AT_ONCE = 4  # pieces between two looks at what they took
+_AT_ONCE = 2  # pieces between two looks at what they took
 _DEEPEST = 24
 _TO_LIMB = 4.0  # by which a piece may come nearer to the limb than it began
 _WAVES_IN_PIECE = 8.0  # length of a piece times waves
@@ -80,27 +80,28 @@ def tabulate(scene: Scene, rtol: float, room: Room, worth: float = math.inf) -> 
     room : Room
         The range, and what absolute errors are allowed in it.
     worth : float, optional
-        Evaluations that the table may take.
+        Evaluations that the table may take; it is given up as soon as it looks as if it took more.
 
     Returns
     -------
     Table or None
         With its honest errors, whether or not they are within the tolerance; None if it takes more than it is worth.
     """
-    begun = scene.effort.evaluations
     lowest = room.lowest
     highest = max(room.highest, lowest * (1.0 + 1e-12) + 1e-300)
     survey = _survey(scene, lowest, highest, rtol, room)
     scale = max(survey.scale, room.largest)
     pending = [_Piece(a, b, *survey.around(a, b)) for a, b in itertools.pairwise(survey.edges(lowest, highest))]
     done: list[tuple[_Piece, _Trial]] = []
+    begun, tried = scene.effort.evaluations, 0
     while pending:
-        if scene.effort.evaluations - begun > worth:
+        if (scene.effort.evaluations - begun) * (1.0 + len(pending) / max(tried, 1)) > worth:
             return None
         first = pending[0]
         alike = [p for p in pending if p.digits == first.digits and p.waves == first.waves]
         batch = alike if worth == math.inf else alike[:_AT_ONCE]
         pending = [p for p in pending if p not in batch]
+        tried += len(batch)
         for piece, trial in zip(batch, _try(scene, batch, rtol, room, 0.5 * ROUNDING * scale), strict=True):
             exhausted = piece.depth >= _DEEPEST or len(done) + len(pending) > _MOST_PIECES
             # what halving gained once it gains again: at that rate, how many pieces would it take?

@@ -123,9 +123,12 @@ def test_whole_table_alone() -> None:
 @pytest.mark.gate
 @pytest.mark.parametrize("rtol", TOLERANCES)
 def test_whole_table_within_maps(rtol: float) -> None:
-    """All problems as pixels of maps of their BRDF and source."""
-    wrong = [w for pair in PAIRS for w in solve(of(pair), GRID, rtol)]
-    print("\n".join(wrong))
+    """All problems as pixels of maps of their BRDF and source; each map tells what is wrong as soon as it is done."""
+    wrong = []
+    for number, pair in enumerate(PAIRS):
+        found = solve(of(pair), GRID, rtol)
+        print(f"{number + 1} of {len(PAIRS)}: {' / '.join(pair)}", *found, sep="\n    ", flush=True)
+        wrong += found
     record(
         f"problem table, within maps, {rtol:g}",
         f"{len(wrong)} of {len(PROBLEMS)} off, on {len(PAIRS)} maps",

@@ -231,3 +231,13 @@ def test_a_table_under_a_field() -> None:
     off = np.abs(grid.value[8, [4, 12]] - cells.value)  # q = 0, p = -0.75 and 0.75
     assert np.all(off <= grid.error[8, [4, 12]] + cells.error)
     assert np.all(off <= 4e-5 * cells.value)
+
+
+@pytest.mark.parametrize(("kappa", "rtol"), [(1e4, 1e-3), (3.0, 1e-6)])
+def test_a_table_costs_no_more_than_what_it_is_for(kappa: float, rtol: float) -> None:
+    """Seen in a light as narrow as 1e4, a table takes a thousand slopes; of 100 gradients each is summed by itself then."""
+    clay = make_brdf("oren_nayar", albedo=0.8, sigma=0.35)
+    lamp = make_source("lobes", amplitude=1.0, kappa=kappa, theta=0.7, phi=1.0)
+    p, q = np.random.default_rng(5).uniform(-2.0, 2.0, size=(2, 110))
+    few, more = (gonio.reflectance_map(clay, lamp, p[:n], q[:n], rtol=rtol).plan[0].effort.evaluations for n in (96, 110))
+    assert more < 2.0 * few
