@@ -43,7 +43,7 @@ from gonio.integrate.closed_forms import collimated
 from gonio.integrate.cut_disk import crosses
 from gonio.integrate.grid import BLOCK, Gradients, block
 from gonio.integrate.model_sums import over_nodes, over_rule, sum_over_nodes, sums_over_rule
-from gonio.integrate.tails import POINTS, UNDERFLOW, ceiling, nothing
+from gonio.integrate.tails import UNDERFLOW, most_in_disk
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]
@@ -270,9 +270,9 @@ def _segment_rule(  # type: ignore[no-untyped-def]
         dim = total <= 0.01 * floor
         if dim:
             sine, cosine = math.sin(half_angle), math.cos(half_angle)
-            tail = ceiling(weigh, ax, ay, az, s, c, sine, cosine, POINTS, some, parameters)
-            if nothing(tail, math.pi * sine * sine, floor):
-                return total, floor if tail > 0.0 else UNDERFLOW
+            most = most_in_disk(weigh, ax, ay, az, s, c, sine, cosine, True, some, parameters)
+            if most <= floor:
+                return total, max(most, UNDERFLOW)
         if before >= 0.0:
             step = abs(total - before)
             estimate = 2.0 * step
@@ -388,9 +388,8 @@ def _all_disks(  # type: ignore[no-untyped-def]
                 faint, dim = 0.0, total <= 0.01 * floor
                 if dim and not good:
                     ax, ay, az, s, c = g[0, k], g[1, k], g[2, k], g[9, k], g[10, k]
-                    points = POINTS if shadowed else 1
-                    tail = ceiling(weigh, ax, ay, az, s, c, sine, cosine, points, flat, parameters)
-                    good, faint = nothing(tail, solid, floor), floor if tail > 0.0 else UNDERFLOW
+                    faint = most_in_disk(weigh, ax, ay, az, s, c, sine, cosine, shadowed, flat, parameters)
+                    good, faint = faint <= floor, max(faint, UNDERFLOW)
                 if not good and before >= 0.0 and (earlier >= 0.0 or spread < _FLAT):  # two rough rules agree by chance
                     step = abs(total - before)
                     estimate = 2.0 * step if earlier < 0.0 else max(step, 0.01 * abs(before - earlier))

@@ -1,7 +1,12 @@
-"""Where sums over a cap are 0, or next to nothing: is it the far tail of a lobe that the nodes did not meet?
+r"""Where sums over a cap are 0, or next to nothing: is it the far tail of a lobe that the nodes did not meet?
 
-The lobe is highest where the cap comes nearest to the mirror direction. f_r there, and at some points of the rim around, as
-the half vector's distance is not quite that of the directions, bounds the integral from above.
+The lobe is highest where the cap comes nearest to the mirror direction, and f_r there bounds the integral from above, if it
+falls with the angle from that direction. Where it falls with the half vector's angle, :math:`f_r \sim e^{-E}` with
+:math:`E \sim \tan^2\theta_h` or :math:`\ln(1+\tan^2\theta_h)` and
+
+.. math:: \tan\theta_h = \frac{|(\omega_i+\omega_r)_{xy}|}{(\omega_i+\omega_r)_z} ,
+
+a point less than :math:`d = 2\sin\delta` away has at least the share :math:`((1-d/|..|_{xy})/(1+d/|..|_z))^2` of E.
 """
 
 from __future__ import annotations
@@ -19,38 +24,32 @@ Array = NDArray[np.float64]
 UNDERFLOW = 1e-280  # what is 0 may be as much
 _AROUND = np.pi / 8.0 * np.array([0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0])  # on the rim, from the nearest point
 _COSINES, _SINES = np.cos(_AROUND), np.sin(_AROUND)
-POINTS = len(_AROUND)
 _UP = 1e-12  # least height of a direction
 _BETWEEN = 0.95  # of a lobe's exponent at these points: the least anywhere
 _MARGIN = 10.0
 
 
 @jit.part
-def ceiling(weigh, ax, ay, az, s, c, sine, cosine, points, nodes, parameters):  # type: ignore[no-untyped-def]
-    """Sum of f_r [1/sr], not below its largest value, over the `points` of a disk around a where it is highest.
+def most_in_disk(weigh, ax, ay, az, s, c, sine, cosine, by_half, node, parameters):  # type: ignore[no-untyped-def]
+    """Bound of the integral of f_r cos theta_i [1] over a disk around a, for a view at (-s, 0, c).
 
-    For a view at (-s, 0, c); `weigh` is the address that `model_sums.over_nodes` gives, `nodes` (4 or more, 9 or more) is
-    written.
+    `weigh` is the address that `model_sums.over_nodes` gives; `by_half`: the half vector's angle counts; `node`, of 4 rows
+    or more, is written.
     """
     along = s * ax + c * az
     x, y, z = s - along * ax, -along * ay, c - along * az  # towards the mirror direction
     length = math.sqrt(x * x + y * y + z * z)
     if along >= cosine or length < 1e-12:
-        points, nodes[0, 0], nodes[1, 0], nodes[2, 0], nodes[3, 0] = 1, s, 0.0, max(c, _UP), 1.0
-    else:
-        x, y, z = x / length, y / length, z / length
-        u, v, w = ay * z - az * y, az * x - ax * z, ax * y - ay * x
-        for k in range(points):
-            e, f = sine * _COSINES[k], sine * _SINES[k]
-            nodes[0, k], nodes[1, k] = cosine * ax + e * x + f * u, cosine * ay + e * y + f * v
-            nodes[2, k], nodes[3, k] = max(cosine * az + e * z + f * w, _UP), 1.0
-    return sum_over_nodes(weigh, nodes, points, s, c, parameters)
-
-
-@jit.model
-def nothing(most, solid, floor):  # type: ignore[no-untyped-def]
-    """Whether no integral over a solid angle, of f_r with that `ceiling`, is above the floor."""
-    return most <= 0.0 or (most < 1.0 and _MARGIN * solid * math.exp(_BETWEEN * math.log(most)) <= floor)
+        return math.inf
+    e = sine / length
+    x, y, z = cosine * ax + e * x, cosine * ay + e * y, max(cosine * az + e * z, _UP)
+    node[0, 0], node[1, 0], node[2, 0], node[3, 0] = x, y, z, 1.0
+    f_r, share = sum_over_nodes(weigh, node, 1, s, c, parameters), 1.0
+    if by_half:
+        h = math.hypot(x - s, y)
+        share = max(0.0, 1.0 - 2.0 * sine / h) / (1.0 + 2.0 * sine / (z + c)) if h > 0.0 else 0.0
+    exponent = share * share * math.log(max(f_r, 1e-307))
+    return _MARGIN * math.pi * sine * sine * math.exp(exponent) if f_r < 1.0 else math.inf
 
 
 def upper_bound(term: Term, axis: Array, half_angle: float, cos_n: Array, sin_n: Array) -> Array:
