@@ -67,7 +67,17 @@ def derived(facets: Facets, shadowing: str, average: float, p: Array, at: int) -
     at : int
         Index of the latter.
     """
-    near, tip, count = _NEAR * float(p[1]), facets.tip, facets.pieces
+    loss, numbers = _tabulated(facets, shadowing, tuple(map(float, p[1 : 2 + len(facets.parameters)])), at)
+    weight = average * average * (1.0 - loss) / (1.0 - average * loss) / (math.pi * loss)
+    return np.concatenate(([weight], numbers))
+
+
+@functools.lru_cache(maxsize=256)  # a fit changes what is not the facets' own, too
+def _tabulated(facets: Facets, shadowing: str, shape: tuple[float, ...], at: int) -> tuple[float, Array]:
+    """The mean of 1 - E, and `derived` but for the weight, of facets of a shape (alpha and gamma)."""
+    p = np.zeros(at + facets.count)
+    p[1 : 1 + len(shape)], p[at:] = shape, facets.derived(np.array(shape))
+    near, tip, count = _NEAR * shape[0], facets.tip, facets.pieces
     span = math.log((1.0 / near + 1.0) * (1.0 + tip) / tip)
     mu, s = _angles(pieces.nodes(count).ravel() * (span / count), span, near, tip)
     found = np.empty(len(mu))
@@ -82,8 +92,9 @@ def derived(facets: Facets, shadowing: str, average: float, p: Array, at: int) -
     rows = np.exp(np.polynomial.polynomial.polyval(g, table.reshape(count, -1).T))
     slope = mu * s / (s / (mu + near) + mu / (s + tip))
     loss = float(np.sum(rows * w * slope) * (span / count))
-    weight = average * average * (1.0 - loss) / (1.0 - average * loss) / (math.pi * loss)
-    return np.concatenate(([weight, 1.0 / near, count / span], table))
+    numbers = np.concatenate(([1.0 / near, count / span], table))
+    numbers.flags.writeable = False
+    return loss, numbers
 
 
 def _logarithm(losses: Array) -> Array:

@@ -59,6 +59,7 @@ _SAFETY = 64.0  # of the bound
 _MARGIN = 1.25  # of 1 / rho, in the bound
 _NOTHING = 1e-60  # of the solid angle: the far tail of a lobe, of which no digits are asked
 _FAINT = 1e-16  # of the largest value of a map: the same
+_OF_ATOL = 0.25  # of an absolute tolerance, where one is given: the same
 _PROBES = 512  # gradients by which that value is known
 
 
@@ -149,12 +150,15 @@ def add(
     return float(worst), nodes_used, rest
 
 
-def negligible(term: Term, cap: Cap, gradients: Gradients) -> tuple[float, bool]:
-    """What of the integral of f_r cos theta_i [1] is nothing, and whether by the largest of many gradients.
+def negligible(term: Term, cap: Cap, gradients: Gradients, atol: float) -> tuple[float, bool]:
+    """What of the integral of f_r cos theta_i [1] is nothing, and whether next to `atol` or the largest of many gradients.
 
-    Otherwise it is nothing by itself, and counts where no gradient is brighter.
+    Otherwise it is nothing by itself, and counts where no gradient is brighter. `atol` is one of radiance.
     """
     solid = math.pi * math.sin(cap.half_angle) ** 2
+    scale = abs(cap.radiance * term.weight)
+    if scale > 0.0 and _OF_ATOL * atol > _NOTHING * solid * scale:
+        return _OF_ATOL * atol / scale, True
     if gradients.size < _PROBES:
         return _NOTHING * solid, False
     some = gradients.select(np.arange(0, gradients.size, gradients.size // _PROBES)).elements()

@@ -102,7 +102,7 @@ class Run:
 
     def _disk(self, step: Step, cap: Cap, threads: int, value: Array, error: Array) -> float:
         """Most gradients by rules for small disks, the others by the general rule."""
-        floor, known = disk.negligible(step.term, cap, self.gradients)
+        floor, known = disk.negligible(step.term, cap, self.gradients, self.atol)
         v, e = (value, error) if known else (np.zeros_like(value), np.zeros_like(error))
         done = tiling.run(
             lambda tile: disk.add(step.term, cap, self.gradients, tile, self.rtol, floor, v, e),
