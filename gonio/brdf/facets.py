@@ -69,6 +69,8 @@ class Facets:
         Of the values of alpha (and gamma): numbers that density and hidden find from that index on.
     count : int
         How many.
+    slopes : callable, optional
+        Of the same values: derivatives of these numbers by alpha and gamma, shape (2, count).
     width : callable
         Of the same values: half width of the lobe [rad], in units in which ggx has alpha.
     pointed : bool
@@ -88,6 +90,7 @@ class Facets:
     doc: str
     reference: str
     pointed: bool = False
+    slopes: Callable[[Array], Array] | None = None
     steep: Callable[[Array], float] = lambda p: 1.0
     tip: float = 1.0
     pieces: int = 18
@@ -245,24 +248,46 @@ def _hidden_gtr(at: int) -> Any:
 def gtr_normalisation(alpha: float, gamma: float) -> float:
     """C = (gamma - 1) (alpha^2 - 1) / (pi (1 - alpha^(2 - 2 gamma))), continued to gamma = 1 and to alpha = 1."""
 
-    def slope(x: float) -> float:  # (e^x - 1) / x
-        return math.expm1(x) / x if x != 0.0 else 1.0
-
     length = -2.0 * math.log(alpha)
-    return INV_PI * slope(-length) / slope((gamma - 1.0) * length)
+    return INV_PI * _mean_exp(-length) / _mean_exp((gamma - 1.0) * length)
+
+
+def _mean_exp(x: float) -> float:
+    """(e^x - 1) / x, the mean of e^t from 0 to x."""
+    return math.expm1(x) / x if x != 0.0 else 1.0
+
+
+def _mean_exp_slope(x: float) -> float:
+    """Derivative of the logarithm of `_mean_exp`."""
+    if abs(x) < 1.0:
+        return math.fsum(x**k / (math.factorial(k) * (k + 2)) for k in range(20)) / _mean_exp(x)
+    return 1.0 / -math.expm1(-x) - 1.0 / x if x > -700.0 else -1.0 / x
 
 
 def _derived_gtr(values: Array) -> Array:
+    """The numbers of `_gtr`."""
+    return _gtr(values)[0]
+
+
+def _slopes_gtr(values: Array) -> Array:
+    """Their derivatives by alpha and by gamma."""
+    return _gtr(values)[1]
+
+
+def _gtr(values: Array) -> tuple[Array, Array]:
     r"""C, scale b and pieces per unit of the logarithm, and the table of M / s^2.
 
     With the density of slopes :math:`P(t) = C\,(1+t^2)^{\gamma-2} (\alpha^2+t^2)^{-\gamma}` [2]_ and y = cot theta,
-    :math:`M = 2 s y^3 \int_0^\infty x\,(x - \arctan x)\,P(y\sqrt{1+x^2})\,\mathrm{d}x`, here by equal steps of ln x.
+    :math:`M = 2 s y^3 \int_0^\infty x\,(x - \arctan x)\,P(y\sqrt{1+x^2})\,\mathrm{d}x`, here by equal steps of ln x. The
+    derivatives are those under the integral; with alpha the nodes of the table move, too.
     """
     alpha, gamma = (float(v) for v in values)
     c = gtr_normalisation(alpha, gamma)
     b = min(alpha, 0.5)
+    b_slope = 1.0 if alpha < 0.5 else 0.0
     span = math.log(2.0 / b)
-    reached = b * np.exp(pieces.nodes(_GTR_PIECES) * (span / _GTR_PIECES)).ravel()[:, None]  # mu + r
+    share = pieces.nodes(_GTR_PIECES).ravel()[:, None] / _GTR_PIECES
+    reached = b * np.exp(share * span)  # mu + r
     # (mu + r)^2 = E^2 solved for mu; at the far end y -> infinity, s from y
     mu = (reached - b) * (reached + b) / (reached + np.sqrt(reached**2 * (1.0 - b * b) + b**4))
     y = mu / np.sqrt((1.0 - mu) * (1.0 + mu))
@@ -273,9 +298,31 @@ def _derived_gtr(values: Array) -> Array:
     density = c * np.exp((gamma - 2.0) * np.log1p(t2) - gamma * np.log(alpha * alpha + t2))
     # x (x - arctan x) dx = x^2 (x - arctan x) du
     bracket = np.where(x < 0.02, x**3 * (1 / 3 - x * x / 5 + x**4 / 7 - x**6 / 9), x - np.arctan(x))
-    m = 2.0 * step * y[:, 0] ** 3 * (density @ (x * x * bracket))  # M / s
-    per_square = (m * np.sqrt(1.0 + y[:, 0] ** 2)).reshape(_GTR_PIECES, -1)
-    return np.concatenate(([c, b, _GTR_PIECES / span], pieces.table(per_square)))
+    weights = x * x * bracket
+
+    def per_square(logarithmic: Array | float) -> Array:  # M / s^2, or its derivative from that of ln P
+        found: Array = 2.0 * step * y[:, 0] ** 3 * np.sqrt(1.0 + y[:, 0] ** 2) * ((density * logarithmic) @ weights)
+        return found
+
+    length, both = -2.0 * math.log(alpha), alpha * alpha + t2
+    c_slope = -length * _mean_exp_slope((gamma - 1.0) * length)  # of ln C by gamma, and by alpha:
+    c_rise = 2.0 / alpha * (_mean_exp_slope(-length) + (gamma - 1.0) * _mean_exp_slope((gamma - 1.0) * length))
+    values_there = per_square(1.0)
+    by_gamma = per_square(c_slope + np.log1p(t2) - np.log(both))
+    by_alpha = per_square(c_rise - 2.0 * alpha * gamma / both)
+    # b^2 mu^2 - 2 E mu + E^2 = b^2 moves with b, E = 2^share b^(1 - share)
+    rise = ((reached - mu) * (1.0 - share) * reached / b - b * (1.0 - mu * mu)) / (reached - b * b * mu)
+    y_rise = (rise * (1.0 + y * y) ** 1.5)[:, 0]
+    along = per_square(2.0 * t2 / y * ((gamma - 2.0) / (1.0 + t2) - gamma / both))
+    along += values_there * (3.0 / y[:, 0] + y[:, 0] / (1.0 + y[:, 0] ** 2))
+    by_alpha += b_slope * y_rise * along
+
+    def row(first: float, second: float, third: float, nodal: Array) -> Array:
+        return np.concatenate(([first, second, third], pieces.table(nodal.reshape(_GTR_PIECES, -1))))
+
+    numbers = row(c, b, _GTR_PIECES / span, values_there)
+    alphas = row(c * c_rise, b_slope, b_slope * _GTR_PIECES / (span * span * b), by_alpha)
+    return numbers, np.stack((alphas, row(c * c_slope, 0.0, 0.0, by_gamma)))
 
 
 # --- all ------------------------------------------------------------------------------------------------------------------
@@ -300,7 +347,7 @@ FACETS = {
         (_gamma(0.0, 10.0, "exponent of the tail: 2 is ggx, 1 Berry's"),),
         _density_gtr, _hidden_gtr, _derived_gtr, 3 + _GTR_PIECES * pieces.ROW,
         lambda v: float(v[0]) * min(1.0, math.sqrt(2.0 ** (1.0 / max(v[1], 0.5)) - 1.0) / 0.6436),
-        "GTR (generalised Trowbridge-Reitz)", "Burley, SIGGRAPH course, 2012; Heitz, JCGT 3(2), 2014",
+        "GTR (generalised Trowbridge-Reitz)", "Burley, SIGGRAPH course, 2012; Heitz, JCGT 3(2), 2014", slopes=_slopes_gtr,
     ),
     "std": Facets(
         (_gamma(1.51, 1e6, "exponent of the tail: 2 is ggx, infinity Beckmann's"),),

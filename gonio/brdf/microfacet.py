@@ -151,6 +151,12 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
         made = np.concatenate((p[:numbers], own))
         return np.concatenate((own, again.derived(facets, shadowing, average, made, numbers)))
 
+    def slopes(p: Array) -> Array:
+        assert facets.slopes is not None
+        found = np.zeros((len(p), facets.count))
+        found[1 : 1 + shape] = facets.slopes(p[1 : 1 + shape])
+        return found
+
     chosen = {
         "distribution": distribution,
         "fresnel": fresnel,
@@ -182,6 +188,7 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
         kinks=_kinks if shadowing == "v_groove" else None,
         bent=shadowing == "v_groove",
         derived=derived if facets.count or repeated else None,
+        derived_slopes=None if repeated or facets.slopes is None else slopes,
         choices={} if name != "microfacet" else {k: v for k, v in chosen.items() if v != CHOICES[k][0]},
     )  # fmt: skip
 
