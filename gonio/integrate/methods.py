@@ -167,20 +167,17 @@ class Run:
         grid, rtol = self.gradients, self.rtol
         most = max(_FEW, int(_CELLS / _cells_of(field)))  # for cells
         handful = most > _FEW and grid.size <= _HANDFUL
+        if handful:
+            spare = self._spare(value, error)
+            return self._added(*self._cells(step, field, grid.elements(), spare, threads), value, error)
         scene = scene_of(step.term, field, rtol, step.effort, threads)
         table = None
-        if not (handful or slopes_are_few(grid)):
+        if not slopes_are_few(grid):
             room = Room(grid, rtol, self.atol, value, error, threads)
             table = tabulate(scene, rtol, room, self._worth(scene, field, most))
         if table is None:
-            elements, spare = grid.elements(), self._spare(value, error)
-            if handful:
-                v, e = self._cells(step, field, elements, spare, threads)
-            else:
-                v, e = self._slopes(step, scene, field, elements, spare, most, threads)
-            value += v
-            error += e
-            return _largest(e, value, ROUNDING * np.max(np.abs(value), initial=0.0))
+            spare = self._spare(value, error)
+            return self._added(*self._slopes(step, scene, field, grid.elements(), spare, most, threads), value, error)
         negligible = ROUNDING * max(room.largest, table.largest)
 
         def add(tile: tuple[int, int]) -> tuple[float, NDArray[np.intp]]:
@@ -200,6 +197,12 @@ class Run:
         value[missed] += v
         error[missed] += e
         return max(worst, _largest(error[missed], value[missed], negligible))
+
+    def _added(self, v: Array, e: Array, value: Array, error: Array) -> float:
+        """Add v and e to value and error; returns the largest relative error."""
+        value += v
+        error += e
+        return _largest(e, value, ROUNDING * np.max(np.abs(value), initial=0.0))
 
     def _worth(self, scene: Scene, field: Field, most: int) -> float:
         """Evaluations that a table may take: with some hundreds of gradients, as many as slope by slope and by cells."""
