@@ -26,7 +26,7 @@ from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.integrate import reflectance_map
 from gonio.integrate.cap import unit_rule
 from gonio.integrate.frames import Elements
-from gonio.integrate.results import Estimate, MapValues
+from gonio.integrate.results import NOTHING, Estimate, MapValues
 from gonio.source import Collimated, Source
 
 Array = NDArray[np.float64]
@@ -134,7 +134,7 @@ def image_irradiance(
             brdf, source, p_[same], q_[same], None if given is None else given[same], float(width), rtol
         )
     result = Estimate(factor * value, factor * error, error_is_bound=bound)
-    if np.any(error > rtol * np.abs(value) * (1 + 1e-9) + 1e-300):
+    if np.any(error > rtol * np.abs(value) * (1 + 1e-9) + NOTHING):
         raise IntegrationError(
             f"radiance changes too fast over the lens for rtol = {rtol:.1e}; the largest relative error is "
             f"{float(np.max(error / np.maximum(np.abs(value), 1e-300))):.1e}; ask for a larger one or use exc.best",

@@ -275,3 +275,10 @@ def test_image_irradiance_refuses() -> None:
             distance=1.0,
         )  # fmt: skip
     assert np.all(np.isfinite(caught.value.best.value))
+
+
+def test_an_image_in_which_a_lobe_underflows_is_dark_and_no_failure() -> None:
+    """A sun 69 degrees off a lobe of n = 10^4 gives e^-10000: 0, with an error that no tolerance minds."""
+    gloss, sun = make("phong", k_s=1.0, n=1e4), make_source("disk", theta=1.2, phi=0.0, half_angle=0.01, radiance=1.0)
+    got = gonio.image_irradiance(gloss, sun, [0.0, 0.1], 0.0, focal_length=0.05, diameter=0.01, distance=1.0)
+    assert np.all(got.value == 0.0) and np.all(got.error < 1e-250)
