@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 from gonio import jit
 from gonio.brdf import pieces
 from gonio.brdf.base import Parameter
+from gonio.brdf.derivatives import differentiate
 from gonio.brdf.elementary import exp, log, log_near, power
 from gonio.brdf.pieces import read as read_pieces
 
@@ -188,6 +189,13 @@ def _hidden_std(at: int) -> Any:
     return jit.model(std_hidden)
 
 
+def _gamma(lower: float, upper: float, doc: str) -> Parameter:
+    return Parameter("gamma", lower, upper, doc, ("log_normal", math.log(2.0), 0.5))
+
+
+_STD_GAMMA = _gamma(1.51, 1e6, "exponent of the tail: 2 is ggx, infinity Beckmann's")
+
+
 def _derived_std(values: Array) -> Array:
     r"""Of :math:`M = \tfrac12\alpha s\,\sigma^{2\gamma-3}\,T`: knee and scale of T's argument, and T / 2 as a polynomial.
 
@@ -195,9 +203,19 @@ def _derived_std(values: Array) -> Array:
     Gamma(gamma - 1)) and the tail Q = I_sigma^2(gamma - 1, 1/2) / 2 of Student's distribution,
     T / 2 = N sqrt(gamma - 1) / (2 gamma - 3) - y Q / sigma^(2 gamma - 3); T has no singularity but at c = -1.
     """
+    return _std_numbers(_std_nodal(float(values[1])))
+
+
+def _slopes_std(values: Array) -> Array:
+    """Derivatives by alpha, none, and by gamma: of the values at the nodes, which keep digits that coefficients lose."""
+    by_gamma = _std_numbers(differentiate(_std_nodal, float(values[1]), _STD_GAMMA))
+    return np.stack((np.zeros_like(by_gamma), by_gamma))
+
+
+def _std_nodal(gamma: float) -> Array:
+    """Knee and scale of T's argument, and T / 2 at Chebyshev nodes."""
     from scipy.special import betaincc
 
-    gamma = float(values[1])
     knee = _W_KNEE / math.hypot(_W_KNEE, math.sqrt(gamma - 1.0))
     farthest = math.sqrt(-math.expm1(-_REACH / (gamma - 1.5)))  # c at which sigma^(2 gamma - 3) = e^-40
     end = farthest / (farthest + knee)
@@ -206,10 +224,18 @@ def _derived_std(values: Array) -> Array:
     y = c / np.sqrt((1.0 - c) * (1.0 + c)) * math.sqrt(gamma - 1.0)
     tail = 0.5 * betaincc(0.5, gamma - 1.0, c * c) * np.exp(-(gamma - 1.5) * np.log1p(-c * c))
     half = _gamma_ratio(gamma - 1.0) * math.sqrt((gamma - 1.0) / math.pi) / (2.0 * gamma - 3.0) - y * tail
+    return np.concatenate(([knee, 2.0 / end], half))
+
+
+def _std_numbers(nodal: Array) -> Array:
+    """The same with T / 2 as a polynomial."""
     waves = chebyshev.chebvander(chebyshev.chebpts1(_STD_TERMS), _STD_TERMS - 1)
-    series = (2.0 / _STD_TERMS) * waves.T @ half
+    series = (2.0 / _STD_TERMS) * waves.T @ nodal[2:]
     series[0] *= 0.5
-    return np.concatenate(([knee, 2.0 / end], chebyshev.cheb2poly(series)))
+    polynomial = np.zeros(_STD_TERMS)
+    short = chebyshev.cheb2poly(series)  # without zeros at its end
+    polynomial[: len(short)] = short
+    return np.concatenate((nodal[:2], polynomial))
 
 
 def _gamma_ratio(z: float) -> float:
@@ -328,10 +354,6 @@ def _gtr(values: Array) -> tuple[Array, Array]:
 # --- all ------------------------------------------------------------------------------------------------------------------
 
 
-def _gamma(lower: float, upper: float, doc: str) -> Parameter:
-    return Parameter("gamma", lower, upper, doc, ("log_normal", math.log(2.0), 0.5))
-
-
 _WALTER = "Walter et al., EGSR 2007; Heitz, JCGT 3(2), 2014"
 
 FACETS = {
@@ -350,9 +372,9 @@ FACETS = {
         "GTR (generalised Trowbridge-Reitz)", "Burley, SIGGRAPH course, 2012; Heitz, JCGT 3(2), 2014", slopes=_slopes_gtr,
     ),
     "std": Facets(
-        (_gamma(1.51, 1e6, "exponent of the tail: 2 is ggx, infinity Beckmann's"),),
+        (_STD_GAMMA,),
         _density_std, _hidden_std, _derived_std, 2 + _STD_TERMS, lambda v: float(v[0]) * min(1.0, math.sqrt(v[1] - 1.0)),
-        "Student's t", "Ribardiere et al., CGF 36(2), 2017", pointed=True,
+        "Student's t", "Ribardiere et al., CGF 36(2), 2017", pointed=True, slopes=_slopes_std,
         steep=lambda p: max(1.0, 1.0 / (2.0 * float(p[2]) - 3.0)), tip=1e-10, pieces=44,
     ),
 }  # fmt: skip

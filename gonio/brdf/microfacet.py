@@ -151,10 +151,14 @@ def build(distribution: str, fresnel: str, shadowing: str, multiple_scattering: 
         made = np.concatenate((p[:numbers], own))
         return np.concatenate((own, again.derived(facets, shadowing, average, made, numbers)))
 
-    def slopes(p: Array) -> Array:
+    @functools.lru_cache(maxsize=256)
+    def own_slopes(values: tuple[float, ...]) -> Array:
         assert facets.slopes is not None
+        return facets.slopes(np.array(values))
+
+    def slopes(p: Array) -> Array:
         found = np.zeros((len(p), facets.count))
-        found[1 : 1 + shape] = facets.slopes(p[1 : 1 + shape])
+        found[1 : 1 + shape] = own_slopes(tuple(map(float, p[1 : 1 + shape])))
         return found
 
     chosen = {
