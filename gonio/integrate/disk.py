@@ -11,7 +11,8 @@ nodes, the relative error of such a rule is at most
 for all models without kinks, found by trial (tests/property/test_disks.py); for Phong's lobe, which is not bent near the
 horizon and falls like an exponential, g^d is :math:`(\kappa/2)^d/(d+1)!` with kappa half of the spread of ln f_r. So the
 first rule is the least one that cannot miss anything, and its own nodes tell whether it is enough; where they tell nothing,
-or where the BRDF has kinks somewhere, one compiled loop per model climbs from rule to rule until two agree.
+or where the BRDF has kinks somewhere, one compiled loop climbs from rule to rule until two agree. A sum next to nothing is
+the far tail of a lobe, or looks so: f_r where the disk is nearest to the lobe decides (`gonio.integrate.tails`).
 
 A disk that the horizon cuts is, seen from its centre in gnomonic projection, a segment of a circle: points
 :math:`\rho(\cos\psi, s\sin\psi)` with psi from 0 to the horizon and s in [-1, 1], without a singularity.

@@ -55,27 +55,31 @@ def most_in_disk(weigh, ax, ay, az, s, c, sine, cosine, by_half, node, parameter
 def upper_bound(term: Term, axis: Array, half_angle: float, cos_n: Array, sin_n: Array) -> Array:
     """Bound (n,) of the integral of f_r cos theta_i over a cap above the horizon [1]; axis (n, 3) in the local frames."""
     mirror = np.stack((sin_n, np.zeros_like(sin_n), cos_n), axis=-1)
-    along = np.einsum("ni,ni->n", axis, mirror)[:, None]
-    towards = mirror - along * axis
+    at, lit = _nearest(axis, half_angle, mirror)
+    f_r, viewer = np.zeros(lit.size), np.tile(mirror * np.array([-1.0, 1.0, 1.0]), (len(at), 1))
+    accumulate(term.model)(np.ascontiguousarray(at.reshape(-1, 3)), viewer, term.values, 1.0, f_r)
+    most = np.max(np.where(lit, f_r.reshape(lit.shape), 0.0), axis=0)
+    faint = (most > 0.0) & (most < 1.0)
+    most[faint] = most[faint] ** _BETWEEN
+    return np.asarray(_MARGIN * 4.0 * math.pi * math.sin(0.5 * half_angle) ** 2 * most)
+
+
+def _nearest(axis: Array, half_angle: float, mirror: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Directions (k, n, 3) of each cap where a lobe around `mirror` (n, 3) may be highest, and which are lit (k, n)."""
+    cosine, sine = math.cos(half_angle), math.sin(half_angle)
+    along = np.einsum("ni,ni->n", axis, mirror)
+    towards = mirror - along[:, None] * axis
     length = np.linalg.norm(towards, axis=1, keepdims=True)
     towards = np.divide(towards, length, out=np.zeros_like(towards), where=length > 0.0)
     beside = np.cross(axis, towards)
-    rim = math.sin(half_angle) * (_COSINES[:, None, None] * towards + _SINES[:, None, None] * beside)
-    rim += math.cos(half_angle) * axis
+    rim = cosine * axis + sine * (_COSINES[:, None, None] * towards + _SINES[:, None, None] * beside)
     # where the rim sets, and the horizon below the mirror direction
-    flat = np.maximum(np.hypot(axis[:, 0], axis[:, 1]), 1e-300)
-    cosine = math.cos(half_angle) / flat
-    azimuth = np.arctan2(axis[:, 1], axis[:, 0]) + np.arccos(np.clip(cosine, -1.0, 1.0)) * np.array([[1.0], [-1.0]])
-    azimuth = np.concatenate((azimuth, np.zeros((1, len(axis)))))
+    flat = cosine / np.maximum(np.hypot(axis[:, 0], axis[:, 1]), 1e-300)
+    azimuth = np.arctan2(axis[:, 1], axis[:, 0]) + np.arccos(np.clip(flat, -1.0, 1.0)) * np.array([[1.0], [-1.0], [0.0]])
+    azimuth[2] = 0.0
     low = np.stack((np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)), axis=-1)
-    rim_cosine = math.cos(half_angle)
-    sets, ahead, mirrored = np.abs(cosine)[None] <= 1.0, axis[None, :, 0] >= rim_cosine, (along >= rim_cosine).T
+    sets = np.abs(flat) <= 1.0
+    lit = np.concatenate((rim[..., 2] > 0.0, np.stack((sets, sets, axis[:, 0] >= cosine, along >= cosine))))
     at = np.concatenate((rim, low, mirror[None]))
-    lit = np.concatenate((rim[..., 2] > 0.0, sets, sets, ahead, mirrored))
     at[..., 2] = np.maximum(at[..., 2], _UP)
-    f_r, viewer = np.zeros(at[..., 0].size), np.tile(mirror * np.array([-1.0, 1.0, 1.0]), (len(at), 1))
-    accumulate(term.model)(np.ascontiguousarray(at.reshape(-1, 3)), viewer, term.values, 1.0, f_r)
-    most = np.max(np.where(lit, f_r.reshape(len(at), -1), 0.0), axis=0)
-    faint = (most > 0.0) & (most < 1.0)
-    most[faint] = most[faint] ** _BETWEEN
-    return np.asarray(_MARGIN * 4.0 * math.pi * math.sin(0.5 * min(half_angle, math.pi)) ** 2 * most)
+    return at, lit

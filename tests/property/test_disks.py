@@ -13,6 +13,8 @@ import gonio
 from gonio.brdf.base import BRDF
 from gonio.geometry import normal_from_gradient
 from gonio.integrate import disk, scene_radiance
+from gonio.integrate.frames import Elements
+from gonio.integrate.tails import UNDERFLOW, upper_bound
 from gonio.source import Cap
 from tests import problems
 from tests.independent import reflected_radiance
@@ -152,6 +154,20 @@ def test_where_only_the_tail_of_a_lobe_is_lit(others: int) -> None:
             assert error <= max(rtol * value, 1e-13 * np.max(got.value), 1e-250), (scene, value, error)
             faint += 0.0 < truth < 1e-40
     assert faint > 5
+
+
+def test_the_bound_of_a_tail_is_above_it() -> None:
+    """For caps of any size and all views, cut by the horizon or not."""
+    rng = np.random.default_rng(22)
+    for _ in range(150):
+        term, tilt, half_angle = _lobes(rng, 2), rng.uniform(0, 1.5), 10 ** rng.uniform(-3, 0.19)
+        part = _off_the_lobe(rng, tilt, rng.uniform(0, 2.5), half_angle)
+        (cap,), element = problems.make_source([part]).parts, Elements.from_gradient(-math.tan(tilt), 0.0)
+        assert isinstance(cap, Cap)
+        brdf = problems.make_brdf([term])
+        bound = upper_bound(brdf.terms[0], element.local(cap.axis), half_angle, element.cos_theta, element.sin_theta)
+        truth = reflected_radiance({"brdf": [term], "source": [part], "p": -math.tan(tilt), "q": 0.0}, "normal", 1e-6)
+        assert truth <= max(float(bound[0]), UNDERFLOW), (term, part, tilt)
 
 
 def test_a_disk_beyond_the_cut_or_below_the_horizon_gives_nothing() -> None:
