@@ -76,7 +76,7 @@ def explained(output: Output, made: ReflectanceMap, values: MapValues, rtol: flo
 
 def _relative(values: MapValues) -> Array:
     """Error relative to R, 0 where it is below what any tolerance allows."""
-    from gonio.integrate.results import ROUNDING
+    from gonio.integrate.tails import ROUNDING
 
     size = np.abs(values.value)
     counts = (values.error > ROUNDING * np.max(size)) & (size > 0)

@@ -26,7 +26,8 @@ from gonio.errors import GeometryError, IntegrationError, ParameterError
 from gonio.integrate import reflectance_map
 from gonio.integrate.cap import unit_rule
 from gonio.integrate.frames import Elements
-from gonio.integrate.results import NOTHING, Estimate, MapValues
+from gonio.integrate.results import Estimate, MapValues
+from gonio.integrate.tails import NOTHING
 from gonio.source import Collimated, Source
 
 Array = NDArray[np.float64]

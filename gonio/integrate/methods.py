@@ -17,11 +17,11 @@ from gonio.integrate.grid import Gradients, add_beam
 from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step
 from gonio.integrate.quadrature import integrate_cap
-from gonio.integrate.results import NOTHING, ROUNDING
 from gonio.integrate.ring_patches import Room
 from gonio.integrate.ring_scene import Scene
 from gonio.integrate.ring_table import tabulate
 from gonio.integrate.rings import integrate_rings, scene_of, slopes_are_few
+from gonio.integrate.tails import NOTHING, ROUNDING
 from gonio.source import Cap, Collimated
 
 Array = NDArray[np.float64]

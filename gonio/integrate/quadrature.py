@@ -25,7 +25,7 @@ from gonio.integrate.adaptive import edge_rounding
 from gonio.integrate.cap import NO_LAYER, NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.integrate.lights import over_cap
-from gonio.integrate.tails import UNDERFLOW, upper_bound
+from gonio.integrate.tails import ROUNDING, UNDERFLOW, upper_bound
 from gonio.source import Cap
 
 Array = NDArray[np.float64]
@@ -146,7 +146,9 @@ def integrate_cap(
         error[active] = rounding + (np.maximum(2.0 * estimate, 0.5 * allowed) if cautious else estimate)
         if np.all(done):
             break
-    missed, blind = ~done, _blind(scene, lit & ~crossed & (value == 0.0), error)
+    blind = _blind(scene, lit & ~crossed & (value == 0.0), error)
+    matters = error > ROUNDING * np.max(np.abs(value), initial=0.0)
+    missed, blind = ~done & matters, blind & matters
     if not kinked:  # a few that no order suits, such as of tables, whose pieces have borders that are not known
         missed &= unit * np.abs(value) < 0.1 * np.maximum(rtol * np.abs(value), atol)
         missed &= cautious and np.count_nonzero(missed) <= _FEW

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from gonio import jit
 from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate.plan import Step
+from gonio.integrate.tails import NOTHING, ROUNDING
 
 Array = NDArray[np.float64]
-ROUNDING = 1e-13  # of the largest value of a map: errors below it are met by any tolerance
-NOTHING = 1e-250  # [W m^-2 sr^-1], the same: where numbers underflow
 
 
 @dataclass(frozen=True)

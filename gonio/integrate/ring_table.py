@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.integrate.results import ROUNDING
 from gonio.integrate.ring_patches import Room, Table, patches
 from gonio.integrate.ring_scene import MOST_DIGITS, Scene, first_digits, floor_of, on_azimuths, tail_of, truncated
+from gonio.integrate.tails import ROUNDING
 
 Array = NDArray[np.float64]
 _DEGREE = 15

@@ -21,6 +21,8 @@ from gonio.brdf.base import Term, accumulate
 from gonio.integrate.model_sums import sum_over_nodes
 
 Array = NDArray[np.float64]
+ROUNDING = 1e-13  # of the largest value of a map: errors below it are met by any tolerance
+NOTHING = 1e-250  # [W m^-2 sr^-1], the same: where numbers underflow
 UNDERFLOW = 1e-280  # what is 0 may be as much
 _AROUND = np.pi / 8.0 * np.array([0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0])  # on the rim, from the nearest point
 _COSINES, _SINES = np.cos(_AROUND), np.sin(_AROUND)
