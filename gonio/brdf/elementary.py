@@ -1,4 +1,4 @@
-r"""exp, log and power without a branch or a call: loops over them vectorise, as those over math.exp and math.log do not.
+r"""exp, log, power, sine and cosine without a branch or a call: loops over them vectorise, as those over math.exp do not.
 
 Each splits off a power of two by the bits of its argument and leaves the rest to a polynomial:
 
@@ -12,7 +12,8 @@ References
 .. [1] P.-T. P. Tang, "Table-driven implementation of the exponential function in IEEE floating-point arithmetic", ACM Trans.
    Math. Softw. 15(2), 1989; "... of the logarithm function ...", 16(4), 1990, on the reduction in two parts.
 .. [2] FreeBSD msun, e_log.c (Sun Microsystems, 1993): the form of the logarithm and its polynomial of error 2^-58.
-.. [3] T. Ogita, S. M. Rump, S. Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005 (Dekker's product).
+.. [3] The same, k_sin.c and k_cos.c: the polynomials for up to pi / 4.
+.. [4] T. Ogita, S. M. Rump, S. Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005 (Dekker's product).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # 
 _ROOT_HALF_BITS = int(np.float64(math.sqrt(0.5)).view(np.int64))
 _SMALLEST = 2.0**-1022
 _SPLITTER = 2.0**27 + 1.0
+_QUARTER_PI, _HALF_PI, _HALF_PI_LOW = 0.25 * math.pi, 0.5 * math.pi, 6.12323399573676603587e-17
 
 
 @jit.model
@@ -100,8 +102,30 @@ def power(x: float, y: float) -> float:
 
 
 @jit.model
+def sine_and_cosine(x: float) -> tuple[float, float]:
+    """sin x and cos x to 1 eps, absolute, for abs(x) <= pi."""
+    size = x if x > 0.0 else -x
+    first, second = size > _QUARTER_PI, size > 3.0 * _QUARTER_PI
+    quarters = (1.0 if first else 0.0) + (1.0 if second else 0.0)
+    y = (size - quarters * _HALF_PI) - quarters * _HALF_PI_LOW
+    z = y * y
+    s = y + y * z * (-1.66666666666666324348e-01 + z * (8.33333333332248946124e-03 + z * (
+        -1.98412698298579493134e-04 + z * (2.75573137070700676789e-06 + z * (
+            -2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)))))  # fmt: skip
+    r = z * (4.16666666666666019037e-02 + z * (-1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * (
+        -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)))))  # fmt: skip
+    half = 0.5 * z
+    w = 1.0 - half
+    c = w + (((1.0 - w) - half) + z * r)
+    middle = first & (not second)
+    sine = c if middle else (-s if second else s)
+    cosine = -s if middle else (-c if second else c)
+    return (sine if x > 0.0 else -sine), cosine
+
+
+@jit.model
 def two_products(a: float, b: float, c: float, d: float) -> float:
-    """a b + c d to 1 eps where the two cancel to no less than 1e-15 of each: with the products' rounding errors [3]_."""
+    """a b + c d to 1 eps where the two cancel to no less than 1e-15 of each: with the products' rounding errors [4]_."""
     ab, cd = a * b, c * d
     t = _SPLITTER * a
     a_high = t - (t - a)

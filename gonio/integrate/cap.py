@@ -36,6 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
+from gonio.brdf.arctangent import arctan
+from gonio.brdf.elementary import exp, log1p, sine_and_cosine
 
 Array = NDArray[np.float64]
 HALF_PI = 0.5 * math.pi
@@ -123,79 +125,86 @@ def split(features, n, end, panels):  # type: ignore[no-untyped-def]
 
 
 @jit.model
-def exponential(x):  # type: ignore[no-untyped-def]
-    """exp(x) for abs(x) < 40 without a branch or a call, so that loops vectorise; relative error 3e-14."""
-    y = x * (1.0 / 256.0)
-    e = 1.0 + y * (1.0 + y * (1.0 / 2.0) * (1.0 + y * (1.0 / 3.0) * (1.0 + y * (1.0 / 4.0) * (1.0 + y * (1.0 / 5.0) * (
-        1.0 + y * (1.0 / 6.0) * (1.0 + y * (1.0 / 7.0) * (1.0 + y * (1.0 / 8.0) * (1.0 + y * (1.0 / 9.0)))))))))  # fmt: skip
-    for _ in range(8):
-        e = e * e
-    return e
+def arsinh(x):  # type: ignore[no-untyped-def]
+    """arsinh of x >= 0 without a branch or a call."""
+    return log1p(x + x * x / (1.0 + math.sqrt(1.0 + x * x)))
 
 
 @jit.model
-def ring_position(x, w, panel, u0, u1):  # type: ignore[no-untyped-def]
-    """Offset from the panel's centre, and weight, of a node and weight on [0, 1]; u0 < u1 bound the sinh map, if any."""
-    a, b, centre, scale, root_a, root_b = panel[0], panel[1], panel[2], panel[3], panel[4], panel[5]
-    if root_a > 0.0:
-        if root_b > 0.0:
-            s, ds = x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) * w
-        else:
-            s, ds = x * x, 2.0 * x * w
-    elif root_b > 0.0:
-        s, ds = 1.0 - (1.0 - x) * (1.0 - x), 2.0 * (1.0 - x) * w
-    else:
-        s, ds = x, w
-    if u0 == u1:
-        return (a - centre) + (b - a) * s, (b - a) * ds
-    e = math.exp(u0 + (u1 - u0) * s)
-    return 0.5 * scale * (e - 1.0 / e), 0.5 * scale * (e + 1.0 / e) * (u1 - u0) * ds
+def ring_positions(x, w, panel, u0, u1, rings):  # type: ignore[no-untyped-def]
+    """Rings of a panel, for nodes and weights on [0, 1], into the rows: offset from the panel's centre, weight.
 
-
-@jit.model
-def half_ring(a, b, eps, near, edge, sign, x, w, cosines, sines, weights, count):  # type: ignore[no-untyped-def]
-    """Nodes on [a, b] within [0, pi], d from the mirror direction: cos d, sign sin d, weights.
-
-    Layers: the lobe, eps wide, at 0; edges of width `near` at a and `edge` at b.
+    u0 < u1 bound the sinh map, if there is one. Then rows 2 to 5: sine and cosine of t / 2 and of t.
     """
-    if not b > a:
-        return count
-    if near < b - a:
-        u1 = math.asinh((b - a) / near)
-        for j in range(x.size):
-            e = math.exp(u1 * x[j])
-            d = a + 0.5 * near * (e - 1.0 / e)
-            cosines[count + j], sines[count + j] = math.cos(d), sign * math.sin(d)
-            weights[count + j] = w[j] * 0.5 * near * (e + 1.0 / e) * u1
-        return count + x.size
+    a, b, centre, scale = panel[0], panel[1], panel[2], panel[3]
+    root_a, root_b = panel[4] > 0.0, panel[5] > 0.0
+    y, dt, sh, ch, st, ct = rings[0], rings[1], rings[2], rings[3], rings[4], rings[5]
+    for i in range(x.size):
+        s, ds = x[i], w[i]
+        if root_a:
+            if root_b:
+                s, ds = x[i] * x[i] * (3.0 - 2.0 * x[i]), 6.0 * x[i] * (1.0 - x[i]) * w[i]
+            else:
+                s, ds = x[i] * x[i], 2.0 * x[i] * w[i]
+        elif root_b:
+            s, ds = 1.0 - (1.0 - x[i]) * (1.0 - x[i]), 2.0 * (1.0 - x[i]) * w[i]
+        y[i], dt[i] = s, ds
+    if u0 == u1:
+        for i in range(x.size):
+            y[i], dt[i] = (a - centre) + (b - a) * y[i], (b - a) * dt[i]
+    else:
+        for i in range(x.size):
+            e = exp(u0 + (u1 - u0) * y[i])
+            y[i], dt[i] = 0.5 * scale * (e - 1.0 / e), 0.5 * scale * (e + 1.0 / e) * (u1 - u0) * dt[i]
+    if centre == HALF_PI:
+        for i in range(x.size):
+            p, q = sine_and_cosine(0.5 * y[i])
+            sh[i], ch[i] = _ROOT_HALF * (q + p), _ROOT_HALF * (q - p)
+            st[i], ct[i] = (q - p) * (q + p), -2.0 * p * q
+    else:
+        for i in range(x.size):
+            p, q = sine_and_cosine(0.5 * (centre + y[i]))
+            sh[i], ch[i], st[i], ct[i] = p, q, 2.0 * p * q, (q - p) * (q + p)
+
+
+@jit.model
+def from_edge(a, turn, width, u1, sign, x, w, cosines, sines, weights):  # type: ignore[no-untyped-def]
+    """Nodes that gather in a layer of some width at the end a of an interval, which lies to the side `turn`."""
+    for j in range(x.size):
+        e = exp(u1 * x[j])
+        r = 1.0 / e
+        s, c = sine_and_cosine(a + turn * 0.5 * width * (e - r))
+        cosines[j], sines[j], weights[j] = c, sign * s, w[j] * 0.5 * width * (e + r) * u1
+
+
+@jit.model
+def about_lobe(e4, u0, u1, sign, x, w, cosines, sines, weights):  # type: ignore[no-untyped-def]
+    """Nodes d on an interval of a half ring with tan(d / 4) = e4 sinh u, for u in [u0, u1]."""
+    for j in range(x.size):
+        e = exp(u0 + (u1 - u0) * x[j])
+        r = 1.0 / e
+        tau = 0.5 * e4 * (e - r)
+        q = 1.0 / (1.0 + tau * tau)
+        ch, sh = (1.0 - tau * tau) * q, 2.0 * tau * q
+        cosines[j], sines[j] = (ch - sh) * (ch + sh), sign * 2.0 * sh * ch
+        weights[j] = w[j] * (u1 - u0) * 2.0 * e4 * (e + r) * q
+
+
+@jit.model
+def half_ring(a, b, eps, near, edge):  # type: ignore[no-untyped-def]
+    """Nodes on [a, b] within [0, pi], d from the mirror direction: u0, u1, e4 of `about_lobe` and u1 of `from_edge`.
+
+    Layers: the lobe, eps wide, at 0; edges of width `near` at a and `edge` at b. `from_edge` begins at b, or at a if the
+    last number is true; nothing is to be laid where a map has no length.
+    """
     e4 = eps / (1.0 + math.sqrt(max(0.0, 1.0 - eps * eps)))
-    c = b
-    if edge < b:
-        c = min(max(0.5 * (b * b + edge * edge - 4.0 * eps * eps) / b, a), b)
-    n = x.size
-    if c > a:
-        u0 = 0.0 if a == 0.0 else math.asinh(math.tan(0.25 * a) / e4)
-        u1 = math.asinh((1.0 if c == math.pi else math.tan(0.25 * c)) / e4)
-        some_c, some_s, some_w = cosines[count : count + n], sines[count : count + n], weights[count : count + n]
-        for j in range(n):
-            e = exponential(u0 + (u1 - u0) * x[j])
-            r = 1.0 / e
-            tau = 0.5 * e4 * (e - r)
-            q = 1.0 / (1.0 + tau * tau)
-            ch, sh = (1.0 - tau * tau) * q, 2.0 * tau * q
-            some_c[j] = (ch - sh) * (ch + sh)
-            some_s[j] = sign * 2.0 * sh * ch
-            some_w[j] = w[j] * (u1 - u0) * 2.0 * e4 * (e + r) * q
-        count += n
-    if c < b:
-        u1 = math.asinh((b - c) / edge)
-        for j in range(n):
-            e = math.exp(u1 * x[j])
-            d = b - 0.5 * edge * (e - 1.0 / e)
-            cosines[count + j], sines[count + j] = math.cos(d), sign * math.sin(d)
-            weights[count + j] = w[j] * 0.5 * edge * (e + 1.0 / e) * u1
-        count += n
-    return count
+    at_a = near < b - a
+    c = min(max(0.5 * (b * b + edge * edge - 4.0 * eps * eps) / b, a), b) if edge < b else b
+    sine, cosine = sine_and_cosine(0.25 * a)
+    u0 = arsinh(sine / (cosine * e4))
+    sine, cosine = sine_and_cosine(0.25 * c)
+    u1 = u0 if at_a else arsinh(sine / (cosine * e4))
+    return u0, u1, e4, arsinh((b - a) / near if at_a else (b - c) / edge), at_a
 
 
 @jit.model
@@ -310,19 +319,25 @@ def insert(points, n, chi):  # type: ignore[no-untyped-def]
 
 
 @jit.model
-def arcs(sh, ch, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-def]
-    """Azimuths that bound the pieces of a ring, ascending, into points; 0 if all of it is cut away."""
-    delta, chi_m = g[10], g[13]
-    lower, upper, whole = chi_m - math.pi, chi_m + math.pi, True
-    if delta < math.pi:
+def reaches(rings, g):  # type: ignore[no-untyped-def]
+    """Azimuth up to which the clip leaves something of each ring, into row 6: 0 if nothing, pi if all."""
+    sh, ch, reach = rings[2], rings[3], rings[6]
+    for i in range(reach.size):
         # products of sines of half of delta -+ (gamma - t) and of t + gamma +- delta
-        inside = (g[14] * ch + g[15] * sh) * (g[16] * ch - g[17] * sh)
-        beyond = (sh * g[17] + ch * g[16]) * (sh * g[15] - ch * g[14])
-        if inside <= 0.0:
-            return 0, whole
-        if beyond > 0.0:
-            reach = 2.0 * math.atan2(math.sqrt(inside), math.sqrt(beyond))
-            lower, upper, whole = -reach, reach, False
+        inside = (g[14] * ch[i] + g[15] * sh[i]) * (g[16] * ch[i] - g[17] * sh[i])
+        beyond = (sh[i] * g[17] + ch[i] * g[16]) * (sh[i] * g[15] - ch[i] * g[14])
+        cut = beyond > 0.0
+        left = 2.0 * arctan(math.sqrt(max(inside, 0.0)), math.sqrt(beyond if cut else 1.0))
+        reach[i] = (left if cut else math.pi) if inside > 0.0 else 0.0
+
+
+@jit.model
+def arcs(reach, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyped-def]
+    """Azimuths that bound the pieces of a ring of which the clip leaves `reach`, ascending, into points."""
+    chi_m = g[13]
+    lower, upper, whole = chi_m - math.pi, chi_m + math.pi, True
+    if reach < math.pi:
+        lower, upper, whole = -reach, reach, False
     if symmetric:
         if whole:
             lower, upper = 0.0, math.pi
@@ -354,6 +369,36 @@ def arcs(sh, ch, st, ct, symmetric, planes, g, points):  # type: ignore[no-untyp
 
 
 @jit.model
+def one_piece(rings, flipped, layer, sin_gamma):  # type: ignore[no-untyped-def]
+    """`half_ring` of rings of which the clip leaves one piece from the plane of symmetry on, into rows 8 to 12.
+
+    u0, u1, e4 and v, and the width of the layer at the end that the clip has made, if there is one.
+    """
+    st, reach, eps = rings[4], rings[6], rings[7]
+    for i in range(reach.size):
+        left = reach[i] if reach[i] > 0.0 else math.pi
+        sine, _ = sine_and_cosine(left)
+        edge = layer / max(sin_gamma * st[i] * abs(sine), 1e-300) if left < math.pi and layer > 0.0 else 10.0
+        a, b = (math.pi - left, math.pi) if flipped else (0.0, left)
+        u0, u1, e4, v, _ = half_ring(a, b, eps[i], edge if flipped else 10.0, 10.0 if flipped else edge)
+        rings[8, i], rings[9, i], rings[10, i], rings[11, i], rings[12, i] = u0, u1, e4, v, edge
+
+
+@jit.model
+def lay(u0, u1, e4, v, at_a, a, b, near, edge, sign, x, w, arc, m):  # type: ignore[no-untyped-def]
+    """The nodes of one `half_ring` into rows of `arc` (cosine, sine, weight) from m on; their new number."""
+    n = x.size
+    if u1 > u0:
+        about_lobe(e4, u0, u1, sign, x, w, arc[0, m : m + n], arc[1, m : m + n], arc[2, m : m + n])
+        m += n
+    if v > 0.0:
+        some = arc[0, m : m + n], arc[1, m : m + n], arc[2, m : m + n]
+        from_edge(a if at_a else b, 1.0 if at_a else -1.0, near if at_a else edge, v, sign, x, w, *some)
+        m += n
+    return m
+
+
+@jit.part
 def element_nodes(  # type: ignore[no-untyped-def]
     cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, scratch, nodes, count
 ):
@@ -361,92 +406,112 @@ def element_nodes(  # type: ignore[no-untyped-def]
 
     `width` is the lobe's, `depth` that of the structure at the horizon [rad].
     """
-    g, features, panels, points, cosines, sines, arc = scratch
+    g, features, panels, points, rings, arc = scratch
     frame(cos_n, sin_n, axis[0], axis[1], axis[2], half_angle, about_normal, g)
     ux, uy, uz, vx, vy, vz, px, py, pz = g[0], g[1], g[2], g[3], g[4], g[5], g[6], g[7], g[8]
     ax, ay, az, t_m, chi_m = axis[0], axis[1], axis[2], g[12], g[13]
     lobe = width < 10.0
     layer = max(min(depth, cos_n), 1e-15) if depth < NO_LAYER else NO_LAYER
+    layered = lobe and layer < NO_LAYER and not about_normal
     n_features = ring_features(cos_n, sin_n, about_normal, width, depth, planes, g, features)
     n_panels = split(features, n_features, g[11], panels)
     cm, sm = math.cos(chi_m), math.sin(chi_m)
     half = 2.0 if symmetric else 1.0
     sin_gamma = math.sin(g[9])
+    n = x.size
+    y, dt, st, ct, reach, eps = rings[0], rings[1], rings[4], rings[5], rings[6], rings[7]
+    single = symmetric and planes.shape[0] == 0  # one piece per ring, with the lobe's azimuth at one end
+    flipped = abs(chi_m) > HALF_PI
     for k in range(n_panels):
         panel = panels[k]
         start, end, centre, scale = panel[0], panel[1], panel[2], panel[3]
         u0 = u1 = 0.0
         if scale > 0.0 and scale <= 3.0 * (end - start):
             u0, u1 = math.asinh((start - centre) / scale), math.asinh((end - centre) / scale)
-        for i in range(x.size):
-            y, dt = ring_position(x[i], w[i], panel, u0, u1)
-            t = centre + y
-            if centre == HALF_PI:
-                a, b = math.sin(0.5 * y), math.cos(0.5 * y)
-                sh, ch, st, ct = _ROOT_HALF * (b + a), _ROOT_HALF * (b - a), (b - a) * (b + a), -2.0 * a * b
-            else:
-                sh, ch = math.sin(0.5 * t), math.cos(0.5 * t)
-                st, ct = 2.0 * sh * ch, (ch - sh) * (ch + sh)
-            if t <= 0.0 or t >= g[11] or (about_normal and ct <= 0.0):
+        ring_positions(x, w, panel, u0, u1, rings)
+        if g[10] < math.pi:
+            reaches(rings, g)
+        else:
+            reach[:] = math.pi
+        eps[:] = 1.0
+        if lobe:
+            for i in range(n):
+                eps[i] = ring_eps(centre + y[i], st[i], ct[i], cos_n, sin_n, t_m, about_normal, width)
+        if single:
+            one_piece(rings, flipped, layer if layered else 0.0, sin_gamma)
+        for i in range(n):
+            t = centre + y[i]
+            if t <= 0.0 or t >= g[11] or (about_normal and ct[i] <= 0.0) or not reach[i] > 0.0:
                 continue
-            n_points, whole = arcs(sh, ch, st, ct, symmetric, planes, g, points)
-            eps = ring_eps(t, st, ct, cos_n, sin_n, t_m, about_normal, width) if lobe else 1.0
             m = 0
-            for piece in range(n_points - 1):
-                c0, c1 = points[piece] - chi_m, points[piece + 1] - chi_m
-                turn = math.floor(0.5 * (c0 + c1) / math.pi)
-                even = turn % 2 == 0  # the lobe is at even multiples of pi
-                a = c0 - turn * math.pi if even else (turn + 1) * math.pi - c1
-                b = c1 - turn * math.pi if even else (turn + 1) * math.pi - c0
-                a, b = max(a, 0.0), min(b, math.pi)
-                near = edge = 10.0
-                if lobe and layer < NO_LAYER and not about_normal and not whole:
+            if single:
+                a = math.pi - reach[i] if flipped else 0.0
+                b = math.pi if flipped else reach[i]
+                near, sign = rings[12, i], -1.0 if flipped else 1.0
+                m = lay(
+                    rings[8, i], rings[9, i], rings[10, i], rings[11, i], flipped and near < b - a, a, b, near, near,
+                    sign, x, w, arc, m,
+                )  # fmt: skip
+            else:
+                n_points, whole = arcs(reach[i], st[i], ct[i], symmetric, planes, g, points)
+                for piece in range(n_points - 1):
+                    c0, c1 = points[piece] - chi_m, points[piece + 1] - chi_m
+                    turn = math.floor(0.5 * (c0 + c1) / math.pi)
+                    even = turn % 2 == 0  # the lobe is at even multiples of pi
+                    a = c0 - turn * math.pi if even else (turn + 1) * math.pi - c1
+                    b = c1 - turn * math.pi if even else (turn + 1) * math.pi - c0
+                    a, b = max(a, 0.0), min(b, math.pi)
+                    near = edge = 10.0
                     first, last = piece == 0 and not symmetric, piece == n_points - 2
-                    if first or last:
-                        slope = sin_gamma * st * abs(math.sin((c1 if last else c0) + chi_m))
+                    if layered and not whole and (first or last):
+                        slope = sin_gamma * st[i] * abs(math.sin((c1 if last else c0) + chi_m))
                         if last == even:
                             edge = layer / max(slope, 1e-300)
                         else:
                             near = layer / max(slope, 1e-300)
-                if m + 2 * x.size > arc.size:
-                    return -1
-                m = half_ring(a, b, eps, near, edge, 1.0 if even else -1.0, x, w, cosines, sines, arc, m)
+                    if m + 2 * n > arc.shape[1]:
+                        return -1
+                    if b > a:
+                        p0, p1, e4, v, at_a = half_ring(a, b, eps[i], near, edge)
+                        m = lay(p0, p1, e4, v, at_a, a, b, near, edge, 1.0 if even else -1.0, x, w, arc, m)
             if count + m > nodes.shape[1]:
                 return -1
             out_x, out_y, out_z = nodes[0, count : count + m], nodes[1, count : count + m], nodes[2, count : count + m]
             out_w, out_a = nodes[3, count : count + m], nodes[4, count : count + m]
+            cosines, sines, weights = arc[0], arc[1], arc[2]
+            s_t, c_t, weight = st[i], ct[i], half * st[i] * dt[i]
             for j in range(m):
                 c, s = cm * cosines[j] - sm * sines[j], sm * cosines[j] + cm * sines[j]
-                p, q = st * c, st * s
-                xi, yi, zi = p * ux + q * vx + ct * px, p * uy + q * vy + ct * py, p * uz + q * vz + ct * pz
+                p, q = s_t * c, s_t * s
+                xi, yi, zi = p * ux + q * vx + c_t * px, p * uy + q * vy + c_t * py, p * uz + q * vz + c_t * pz
                 lit = zi > 0.0  # rounding at the horizon may say otherwise
                 out_x[j], out_y[j], out_z[j] = xi, yi, zi if lit else 1.0
-                out_w[j] = half * st * dt * arc[j] * zi if lit else 0.0
+                out_w[j] = weight * weights[j] * zi if lit else 0.0
                 out_a[j] = xi * ax + yi * ay + zi * az
             count += m
     return count
 
 
 def _ring_nodes(  # type: ignore[no-untyped-def]
-    cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, nodes, starts
+    some, cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, nodes, starts
 ):
-    size = 2 * MAX_ARCS * x.size
     scratch = (
         np.empty(18), np.empty((MAX_FEATURES, 3)), np.empty((MAX_PANELS, 6)), np.empty(MAX_ARCS),
-        np.empty(size), np.empty(size), np.empty(size),
+        np.empty((13, x.size)), np.empty((3, 2 * MAX_ARCS * x.size)),
     )  # fmt: skip
     count = 0
     starts[0] = 0
-    for k in range(cos_n.size):
+    for k in range(some.size):
+        i = some[k]
         more = element_nodes(
-            cos_n[k], sin_n[k], axis[k], half_angle, about_normal[k], width, depth, planes[k], symmetric[k],
+            cos_n[i], sin_n[i], axis[i], half_angle, about_normal[i], width, depth, planes[i], symmetric[i],
             x, w, scratch, nodes, count,
         )  # fmt: skip
         if more < 0:
             return k
         count = more
         starts[k + 1] = count
-    return cos_n.size
+    return some.size
 
 
 ring_nodes = jit.kernel(_ring_nodes, fastmath=False)

@@ -38,8 +38,9 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf.base import Term
+from gonio.brdf.elementary import exp, sine_and_cosine
 from gonio.integrate import cut_disk
-from gonio.integrate.cap import exponential, unit_rule
+from gonio.integrate.cap import unit_rule
 from gonio.integrate.closed_forms import collimated
 from gonio.integrate.cut_disk import crosses
 from gonio.integrate.grid import BLOCK, Gradients, block
@@ -196,19 +197,6 @@ def tangents(ax, ay, az):  # type: ignore[no-untyped-def]
 
 
 @jit.model
-def sine_and_cosine(x):  # type: ignore[no-untyped-def]
-    """sin and cos of x in [0, pi] to 1e-15, without a branch or a call, so that loops vectorise."""
-    y = 0.25 * x
-    z = y * y
-    s = y * (1.0 - z / 6.0 * (1.0 - z / 20.0 * (1.0 - z / 42.0 * (1.0 - z / 72.0 * (1.0 - z / 110.0 * (
-        1.0 - z / 156.0 * (1.0 - z / 210.0)))))))  # fmt: skip
-    c = 1.0 - z / 2.0 * (1.0 - z / 12.0 * (1.0 - z / 30.0 * (1.0 - z / 56.0 * (1.0 - z / 90.0 * (
-        1.0 - z / 132.0 * (1.0 - z / 182.0 * (1.0 - z / 240.0)))))))  # fmt: skip
-    s, c = 2.0 * s * c, 1.0 - 2.0 * s * s
-    return 2.0 * s * c, 1.0 - 2.0 * s * s
-
-
-@jit.model
 def inverse(real, imaginary, sine):  # type: ignore[no-untyped-def]
     """1 / rho of the ellipse (Bernstein's) about [-sine, sine] through a complex point."""
     x, y = real / sine, imaginary / sine
@@ -253,7 +241,7 @@ def _segment_rule(  # type: ignore[no-untyped-def]
         m = cuts[min(first + level, cuts.size - 1)] - begin
         at = 0
         for i in range(n):
-            e = exponential(reach * x[cuts[level] + i])
+            e = exp(reach * x[cuts[level] + i])
             sin_psi, cos_psi = sine_and_cosine(end - 0.5 * width * (e - 1.0 / e))
             across = rho * sin_psi
             some[4, i], some[5, i] = rho * cos_psi, across

@@ -16,6 +16,7 @@ from gonio.integrate.frames import Elements
 from gonio.integrate.grid import Gradients, add_beam
 from gonio.integrate.lights import over_field
 from gonio.integrate.plan import Method, Step
+from gonio.integrate.profile import sample
 from gonio.integrate.quadrature import integrate_cap
 from gonio.integrate.ring_patches import Room
 from gonio.integrate.ring_scene import Scene
@@ -276,10 +277,10 @@ class Run:
         return _largest(e, v, 0.0)
 
     def _table(self, step: Step, cap: Cap, threads: int) -> radial.Table:
-        def profile(tau: Array) -> tuple[Array, Array]:
-            return integrate_cap(
-                step.term, cap, radial.elements(tau), rtol=_SAMPLE * self.rtol, atol=_SAMPLE * self.atol,
-                about_normal=None, effort=step.effort, threads=threads, cautious=False,
+        def profile(tau: Array, finer: NDArray[np.intp]) -> tuple[Array, Array]:
+            return sample(
+                step.term, cap, tau, radial.PROBES, finer, rtol=_SAMPLE * self.rtol, atol=_SAMPLE * self.atol,
+                effort=step.effort, threads=threads,
             )  # fmt: skip
 
         width = min(step.term.lobe_width() or 1.0, 1.0)

@@ -26,14 +26,18 @@ from gonio.integrate.frames import Elements
 from gonio.integrate.grid import BLOCK, Gradients
 
 Array = NDArray[np.float64]
-Profile = Callable[[Array], tuple[Array, Array]]
+Profile = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
 _NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no digits are left to agree
 _STEEP = 30.0  # ratio of the values of a piece from which on it is their logarithm that is a polynomial
+_SHORT = 0.4  # of the tolerance, for the samples, whose share is an eighth: more than they should take
 _DEEPEST = 40  # halvings
+_MOST_PIECES = 500
+_NOISE = 0.35  # ratio of the last coefficients to those before from which on they are noise of the samples
 _FIRST, _GROWTH = 1.9, 4.4  # widths of a feature: the interval next to it, and how the others grow
 _RATE = 2.8  # the series of intervals graded so fall at least like this
-_PROBES = np.array([-1.0, -0.45, 0.2, 1.0])
+_BETWEEN = np.array([-1.0, -0.45, 0.2, 1.0])
+PROBES = len(_BETWEEN)
 _LOOKUP = 256
 _END = 1.0 - 2.0**-53
 
@@ -123,7 +127,8 @@ def tabulate(
     Parameters
     ----------
     profile : callable
-        tau (k,) -> value (k,), error (k,).
+        tau (k, n), finer (k,) -> value (k, n), error (k, n), for the places of k pieces, of which the last `PROBES` tell of
+        all; where `finer` is 1, values should be more exact than they seem to have to be.
     upper : float
         Largest tan(theta_n / 2), below 1.
     rtol, atol : float
@@ -139,15 +144,16 @@ def tabulate(
     degree = int(np.clip(math.ceil(math.log(10.0 / max(rtol, 1e-14)) / math.log(_RATE)), 7, 27))
     nodes, to_series = _to_series(degree)
     lebesgue = 1.0 + (2.0 / math.pi) * math.log(degree + 1.0)
-    places = np.concatenate((nodes, _PROBES))
-    at_probes = np.polynomial.chebyshev.chebvander(_PROBES, degree)
+    places = np.concatenate((nodes, _BETWEEN))
+    at_probes = np.polynomial.chebyshev.chebvander(_BETWEEN, degree)
     bounds = _breaks(max(upper, 1e-3), features)
-    pending = [(a, b, 0) for a, b in itertools.pairwise(bounds)]
+    pending = [(a, b, 0, 0) for a, b in itertools.pairwise(bounds)]
     ready: list[tuple[float, float, Array, float, bool]] = []
     relative_error = top = 0.0
     while pending:
         a, b = (np.array([piece[k] for piece in pending])[:, None] for k in (0, 1))
-        value, sampled = (v.reshape(len(pending), -1) for v in profile((a + 0.5 * (b - a) * (places + 1.0)).ravel()))
+        finer = np.array([piece[3] for piece in pending])
+        value, sampled = profile(a + 0.5 * (b - a) * (places + 1.0), finer)
         top = max(top, float(np.max(np.abs(value))))
         absolute = max(atol, _NOTHING * top)
         least, most = np.min(value, axis=1), np.max(value, axis=1)
@@ -156,17 +162,20 @@ def tabulate(
         series = value[:, : degree + 1] @ to_series.T
         missed = np.max(np.abs(series @ at_probes.T - value[:, degree + 1 :]), axis=1)
         worst, size = np.max(sampled, axis=1), np.where(steep, 1.0, np.min(np.abs(value), axis=1))
-        interpolation = np.maximum(2.0 * missed, 0.5 * np.sum(np.abs(series[:, -2:]), axis=1))
+        tail, before = np.sum(np.abs(series[:, -2:]), axis=1), np.sum(np.abs(series[:, -4:-2]), axis=1)
+        interpolation = np.maximum(2.0 * missed, 0.5 * tail)
         allowed = np.maximum(rtol * size, np.where(steep, 0.0, absolute)) - lebesgue * worst
         # where the samples themselves fall short, halving can't help
         scale = np.where(steep[:, None], 1.0, np.maximum(np.abs(value), absolute / rtol + 1e-300))
         relative = np.max(sampled / scale, axis=1)
-        allowed = np.where(lebesgue * relative > 0.9 * rtol, np.maximum(allowed, 2.0 * worst), allowed)
+        allowed = np.where(lebesgue * relative > _SHORT * rtol, np.maximum(allowed, 2.0 * worst), allowed)
         again = []
-        for k, (left, right, depth) in enumerate(pending):
-            if interpolation[k] > allowed[k] and depth < _DEEPEST:
+        for k, (left, right, depth, orders) in enumerate(pending):
+            if interpolation[k] > allowed[k] and orders == 0 and tail[k] > _NOISE * before[k]:
+                again.append((left, right, depth, 1))
+            elif interpolation[k] > allowed[k] and depth < _DEEPEST and len(ready) + len(again) < _MOST_PIECES:
                 middle = 0.5 * (left + right)
-                again += [(left, middle, depth + 1), (middle, right, depth + 1)]
+                again += [(left, middle, depth + 1, orders), (middle, right, depth + 1, orders)]
             else:
                 rounding = 4.0 * (degree + 1) * np.finfo(float).eps * float(np.max(np.abs(value[k])))
                 error = max(interpolation[k] + lebesgue * worst[k], 0.3 * rtol * size[k]) + rounding

@@ -60,10 +60,12 @@ def insist(result: MapValues, rtol: float, atol: float) -> MapValues:
         If a value is NaN or infinite, which only a function of the user's can make it.
     """
     value, error = result.value.ravel(), result.error.ravel()
-    missed, largest, worst = _missed(value, error, rtol, atol)
+    largest = max(float(np.max(value, initial=0.0)), -float(np.min(value, initial=0.0)))  # NaN if one is
     if not math.isfinite(largest):
         raise ParameterError("f_r or the radiance is NaN or infinite for a direction above the horizon; both must be finite")
+    missed = _missed(value, error, rtol, atol, ROUNDING * largest)
     if missed:
+        worst = float(np.max(error[value != 0.0] / np.abs(value[value != 0.0]), initial=0.0))
         raise IntegrationError(
             f"reflectance map: reached a relative error of {worst:.1e} where {rtol:.1e} was asked for, at "
             f"{missed} of {value.size} gradients; ask for a larger rtol or use the result in exc.best",
@@ -72,19 +74,14 @@ def insist(result: MapValues, rtol: float, atol: float) -> MapValues:
     return result
 
 
-def _judge(value, error, rtol, atol):  # type: ignore[no-untyped-def]
-    """How many miss the tolerance by more than rounding, largest value (infinite for NaN), largest relative error."""
-    largest = 0.0
+def _count(value, error, rtol, atol, negligible):  # type: ignore[no-untyped-def]
+    """How many miss the tolerance by more than rounding."""
+    missed = 0
     for k in range(value.size):
-        largest = max(largest, abs(value[k]) if value[k] == value[k] else math.inf)
-    missed, worst = 0, 0.0
-    for k in range(value.size):
-        size = abs(value[k])
-        if error[k] > max(rtol * size, atol) * (1.0 + 1e-9) + NOTHING and error[k] > ROUNDING * largest:
-            missed += 1
-        if size > 0.0 and error[k] > worst * size:
-            worst = error[k] / size
-    return missed, largest, worst
+        wanted = rtol * abs(value[k])
+        wanted = (wanted if wanted > atol else atol) * (1.0 + 1e-9) + NOTHING
+        missed += (error[k] > wanted) & (error[k] > negligible)
+    return missed
 
 
-_missed = jit.kernel(_judge, fastmath=False)
+_missed = jit.kernel(_count, fastmath=False)
