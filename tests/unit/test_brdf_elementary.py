@@ -1,4 +1,4 @@
-"""exp, log and power of the models' loops against 40 digits, and at the ends of their ranges."""
+"""exp, log, power, sine and cosine of the models' loops against 40 digits, and at the ends of their ranges."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from gonio.brdf.elementary import exp, log, log1p, power
+from gonio.brdf.elementary import exp, log, log1p, power, sine_and_cosine
 
 EPS = 2.0**-52
 _RNG = np.random.default_rng(8)
@@ -58,3 +58,12 @@ def test_ends() -> None:
     assert [log1p(x) for x in (-1.0, 0.0, 5e-324)] == [-math.inf, 0.0, 5e-324]
     assert math.isnan(exp(math.nan))
     assert [power(0.0, 0.0), power(0.0, 1e-300), power(0.0, 4.0), power(2.0, 0.0)] == [1.0, 0.0, 0.0, 1.0]
+
+
+def test_sine_and_cosine() -> None:
+    numbers = [*_RNG.uniform(-math.pi, math.pi, 1500), *_signed(300, -300, 0), 0.0, math.pi, -math.pi / 2, math.pi / 4]
+    with mpmath.workdps(40):
+        for x in map(float, numbers):
+            sine, cosine = sine_and_cosine(x)
+            true = mpmath.sin(x), mpmath.cos(x)
+            assert abs(sine - true[0]) <= EPS * min(1, 2 * abs(x)) and abs(cosine - true[1]) <= EPS
