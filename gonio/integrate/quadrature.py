@@ -22,9 +22,10 @@ from gonio.brdf.base import Term, accumulate
 from gonio.errors import IntegrationError
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import edge_rounding
-from gonio.integrate.cap import NO_LAYER, NODE_ROWS, ring_nodes, unit_rule
+from gonio.integrate.cap import NODE_ROWS, ring_nodes, unit_rule
 from gonio.integrate.frames import Elements
 from gonio.integrate.lights import over_cap
+from gonio.integrate.panels import NO_LAYER
 from gonio.integrate.tails import ROUNDING, UNDERFLOW, upper_bound
 from gonio.source import Cap
 
