@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from gonio.brdf import plugins
-from gonio.brdf.base import BRDF, Model, Parameter, Term, term_names
+from gonio.brdf.base import BRDF, Model, Term, term_names
 from gonio.brdf.families import FAMILIES, Family, find, parse
 from gonio.brdf.function import from_function, probe
+from gonio.brdf.parameter import Parameter
 from gonio.errors import ParameterError
 
 __all__ = ["BRDF", "Family", "Model", "Parameter", "Term", "from_function", "make", "models", "parse", "term_names"]

@@ -13,76 +13,20 @@ References
 from __future__ import annotations
 
 import difflib
-import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gonio import jit
+from gonio.brdf.kernels import accumulate, sum_kernel
+from gonio.brdf.parameter import Parameter
 from gonio.errors import GeometryError, ParameterError
 from gonio.geometry import unit_vector
 
 Array = NDArray[np.float64]
 _SLANTED = np.array([0.6, 0.0, 0.8])
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """Declaration of one parameter of a model.
-
-    Attributes
-    ----------
-    name, unit, doc : str
-    lower, upper : float
-        Closed range.
-    prior : tuple
-        Default prior of a fit: ``("uniform", lower, upper)`` or ``("log_normal", mean of ln, sd of ln)``, cut to the range.
-    fixed : float, optional
-        Value at which a fit holds the parameter unless it is freed.
-    default : float, optional
-        Value where none is given; without it the parameter must be given.
-    """
-
-    name: str
-    lower: float
-    upper: float
-    doc: str
-    prior: tuple[str, float, float]
-    unit: str = "1"
-    fixed: float | None = None
-    default: float | None = None
-
-    def __post_init__(self) -> None:
-        if not self.name.isidentifier():
-            raise ParameterError(f"parameter {self.name!r}: its name is used as a keyword; take letters, digits and _")
-        if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
-            raise ParameterError(
-                f"parameter {self.name}: its range {self.lower:g} to {self.upper:g} is none; give a finite lower end below "
-                "the upper one"
-            )
-        if not (isinstance(self.prior, tuple) and len(self.prior) == 3 and self.prior[0] in ("uniform", "log_normal")):
-            raise ParameterError(
-                f'parameter {self.name}: its prior {self.prior!r} is not known; write ("uniform", lower, upper) or '
-                '("log_normal", mean of ln, standard deviation of ln)'
-            )
-        for value in (self.fixed, self.default):
-            if value is not None:
-                self.check(value, f"parameter {self.name}")
-
-    def check(self, value: float, owner: str) -> float:
-        """The value as float, or a `ParameterError` naming what is allowed."""
-        allowed = f"[{self.lower:g}, {self.upper:g}]" + ("" if self.unit == "1" else f" {self.unit}")
-        try:
-            number = float("text" if isinstance(value, str | bool) else value)
-        except (TypeError, ValueError):
-            raise ParameterError(f"{owner}: {self.name} = {value!r} is not a number; choose one inside {allowed}") from None
-        if not (math.isfinite(number) and self.lower <= number <= self.upper):
-            raise ParameterError(f"{owner}: {self.name} = {number:g} is outside {allowed}; choose one inside")
-        return number
 
 
 @dataclass(frozen=True)
@@ -409,84 +353,6 @@ class BRDF:
         flat_i, flat_r = np.ascontiguousarray(wi.reshape(-1, 3)), np.ascontiguousarray(wr.reshape(-1, 3))
         rows = jacobian(self.terms, flat_i, flat_r)
         return np.moveaxis(rows.reshape(len(rows), *wi.shape[:-1]), 0, -1)
-
-
-def accumulate(model: Model) -> Any:
-    """``kernel(omega_i (n, 3), omega_r (n, 3), p, weight, out (n,))`` that adds weight * f_r; compiled if it can be."""
-    if model.array_function is not None:
-        return functools.partial(_accumulate_array, model.array_function)
-    if model.function is None:
-        raise ParameterError(
-            f"{model.name} is a delta function and has no value at a pair of directions; use it in a reflectance map"
-        )
-    return _accumulate(model.function)
-
-
-@jit.model
-def _known(xi: float, yi: float, zi: float, xr: float, yr: float, zr: float, value: float) -> float:
-    """The value, NaN if a direction is; models that need few of the six numbers are faster where all are loaded in a row."""
-    return value if (xi == xi) & (yi == yi) & (zi == zi) & (xr == xr) & (yr == yr) & (zr == zr) else math.nan
-
-
-@functools.cache
-def _accumulate(function: Callable[..., float]) -> Any:
-    def accumulate_terms(omega_i, omega_r, p, weight, out):  # type: ignore[no-untyped-def]
-        i, r = omega_i.ravel(), omega_r.ravel()  # with one index the loop vectorises
-        for k in range(out.size):
-            xi, yi, zi, xr, yr, zr = i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2]
-            out[k] += weight * _known(xi, yi, zi, xr, yr, zr, function(xi, yi, zi, xr, yr, zr, p))
-
-    return jit.kernel(accumulate_terms, apart=True)
-
-
-def sum_kernel(terms: Sequence[Term]) -> tuple[Any, Array] | None:
-    """``kernel(omega_i (n, 3), omega_r (n, 3), p, out (n,))`` that fills `out` with a sum of compiled terms, and its p.
-
-    None for a single term or if one isn't compiled.
-    """
-    functions = tuple(term.model.function for term in terms)
-    if len(functions) < 2 or None in functions:
-        return None
-    packed = np.array([x for term in terms for x in (term.weight, *term.values)])
-    return _sum_kernel(functions, tuple(len(term.values) for term in terms)), packed
-
-
-@functools.cache
-def _sum_kernel(functions: tuple[Any, ...], sizes: tuple[int, ...]) -> Any:
-    """Kernel of a sum of terms; its parameter array holds, term after term, weight and parameters."""
-    total: Any = None
-    start = 0
-    for function, size in zip(functions, sizes, strict=True):
-        total = _joined(total, function, start, size)
-        start += 1 + size
-
-    def fill_with_sum(omega_i, omega_r, p, out):  # type: ignore[no-untyped-def]
-        i, r = omega_i.ravel(), omega_r.ravel()
-        for k in range(out.size):
-            xi, yi, zi, xr, yr, zr = i[3 * k], i[3 * k + 1], i[3 * k + 2], r[3 * k], r[3 * k + 1], r[3 * k + 2]
-            out[k] = _known(xi, yi, zi, xr, yr, zr, total(xi, yi, zi, xr, yr, zr, p))
-
-    return jit.kernel(fill_with_sum, apart=True)
-
-
-def _joined(before: Any, function: Callable[..., float], start: int, size: int) -> Any:
-    """The sum with one more term, whose weight is p[start]."""
-    first, stop = start + 1, start + 1 + size
-
-    def only(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-        return p[start] * function(xi, yi, zi, xr, yr, zr, p[first:stop])
-
-    def both(xi, yi, zi, xr, yr, zr, p):  # type: ignore[no-untyped-def]
-        return before(xi, yi, zi, xr, yr, zr, p) + p[start] * function(xi, yi, zi, xr, yr, zr, p[first:stop])
-
-    return jit.model(only if before is None else both)
-
-
-def _accumulate_array(
-    function: Callable[[Array, Array, Array], Array], omega_i: Array, omega_r: Array, p: Array, weight: float, out: Array
-) -> None:
-    unknown = np.isnan(omega_i).any(axis=1) | np.isnan(omega_r).any(axis=1)
-    out += weight * np.where(unknown, np.nan, function(omega_i, omega_r, p))
 
 
 def term_names(models: Iterable[Model]) -> tuple[str, ...]:

@@ -29,8 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.elementary import exp, log1p
+from gonio.brdf.parameter import Parameter
 from gonio.brdf.phong import power_width
 
 Array = NDArray[np.float64]

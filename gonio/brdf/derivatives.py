@@ -28,7 +28,8 @@ from gonio.brdf.tangent import tangent
 from gonio.errors import ParameterError
 
 if TYPE_CHECKING:
-    from gonio.brdf.base import Model, Parameter, Term
+    from gonio.brdf.base import Model, Term
+    from gonio.brdf.parameter import Parameter
 
 Array = NDArray[np.float64]
 NODES, LEVELS = 13, 9  # of an interpolating polynomial; of interval lengths tried, each a quarter of the one before
@@ -139,7 +140,7 @@ def _along(function: Callable[[Array], Array], p: Array, j: int) -> Callable[[fl
 
 
 def _differences(term: Term, omega_i: Array, omega_r: Array) -> Array:
-    from gonio.brdf.base import accumulate
+    from gonio.brdf.kernels import accumulate
 
     model, kernel = term.model, accumulate(term.model)
     k = len(model.parameters)

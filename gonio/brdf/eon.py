@@ -30,8 +30,9 @@ import math
 
 from gonio import jit
 from gonio.brdf.arctangent import arctan
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.oren_nayar import kinks
+from gonio.brdf.parameter import Parameter
 
 INV_PI = 1.0 / math.pi
 K_1 = 0.5 - 2.0 / (3.0 * math.pi)

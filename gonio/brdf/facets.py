@@ -43,9 +43,9 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf import pieces
-from gonio.brdf.base import Parameter
 from gonio.brdf.derivatives import differentiate
 from gonio.brdf.elementary import exp, log, log_near, power
+from gonio.brdf.parameter import Parameter
 from gonio.brdf.pieces import read as read_pieces
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Parameter
+from gonio.brdf.parameter import Parameter
 from gonio.brdf.plastic import diffuse_reflectance
 
 Array = NDArray[np.float64]

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import BRDF, Model, Term, _accumulate
+from gonio.brdf.base import BRDF, Model, Term
+from gonio.brdf.kernels import _accumulate
 from gonio.errors import ParameterError
 from gonio.geometry import unit_vector
 

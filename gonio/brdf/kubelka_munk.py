@@ -24,7 +24,8 @@ from __future__ import annotations
 import math
 
 from gonio import jit
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
+from gonio.brdf.parameter import Parameter
 
 INV_PI = 1.0 / math.pi
 

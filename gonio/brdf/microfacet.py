@@ -33,9 +33,10 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf import multiple_scattering as again
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.facets import FACETS
 from gonio.brdf.fresnel import FRESNEL
+from gonio.brdf.parameter import Parameter
 from gonio.errors import ParameterError
 
 Array = NDArray[np.float64]

@@ -38,7 +38,8 @@ from numpy.typing import NDArray
 
 from gonio import jit
 from gonio.brdf.arctangent import arctan
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
+from gonio.brdf.parameter import Parameter
 
 Array = NDArray[np.float64]
 INV_PI = 1.0 / math.pi

@@ -35,8 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.elementary import exp, log_near, two_products
+from gonio.brdf.parameter import Parameter
 
 Array = NDArray[np.float64]
 INV_TWO_PI = 0.5 / math.pi

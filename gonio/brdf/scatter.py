@@ -35,8 +35,9 @@ from numpy.typing import NDArray
 from scipy.special import digamma
 
 from gonio import jit
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.elementary import exp, log1p, power
+from gonio.brdf.parameter import Parameter
 
 Array = NDArray[np.float64]
 _CUSP = 0.03

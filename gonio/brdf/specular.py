@@ -7,7 +7,8 @@ References
 
 from __future__ import annotations
 
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
+from gonio.brdf.parameter import Parameter
 
 SPECULAR = Model(
     name="specular",

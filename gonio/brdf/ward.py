@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Model, Parameter
+from gonio.brdf.base import Model
 from gonio.brdf.elementary import exp
+from gonio.brdf.parameter import Parameter
 
 Array = NDArray[np.float64]
 INV_PI = 1.0 / math.pi

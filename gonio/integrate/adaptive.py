@@ -22,7 +22,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.brdf.base import Term, accumulate
+from gonio.brdf.base import Term
+from gonio.brdf.kernels import accumulate
 from gonio.errors import IntegrationError, ParameterError
 from gonio.integrate import threads
 from gonio.integrate.cells import COLUMNS, MOST_PLANES, NODES, build, fill, place, sums

@@ -23,7 +23,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gonio.brdf.base import Term, accumulate
+from gonio.brdf.base import Term
+from gonio.brdf.kernels import accumulate
 from gonio.fields import Field
 from gonio.integrate.frames import Elements
 from gonio.source import Cap, Collimated

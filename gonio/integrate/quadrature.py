@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Term, accumulate
+from gonio.brdf.base import Term
+from gonio.brdf.kernels import accumulate
 from gonio.errors import IntegrationError
 from gonio.integrate import threads as tiling
 from gonio.integrate.adaptive import edge_rounding

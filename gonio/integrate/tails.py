@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import Term, accumulate
+from gonio.brdf.base import Term
+from gonio.brdf.kernels import accumulate
 from gonio.integrate.model_sums import sum_over_nodes
 
 Array = NDArray[np.float64]

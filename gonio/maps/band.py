@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gonio import jit
-from gonio.brdf.base import BRDF, Model, accumulate
+from gonio.brdf.base import BRDF, Model
+from gonio.brdf.kernels import accumulate
 from gonio.geometry import unit_vector
 from gonio.integrate import threads
 from gonio.integrate.results import MapValues

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import gonio
-from gonio.brdf.base import sum_kernel
+from gonio.brdf.kernels import sum_kernel
 from tests.benchmarks.scenes import Scene
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from gonio.brdf import BRDF, Model, Term
-from gonio.brdf.base import accumulate
+from gonio.brdf.kernels import accumulate
 from tests.benchmarks import page
 from tests.benchmarks.kernels import SIZE, _directions, build
 from tests.registered import compiled, typical
