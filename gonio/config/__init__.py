@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gonio.config.axis import AxisConfig
 from gonio.config.documents import (
     FitConfig,
     GridConfig,
@@ -18,7 +19,6 @@ from gonio.config.documents import (
 )
 from gonio.config.reader import read_document
 from gonio.config.rig import (
-    AxisConfig,
     BusConfig,
     CameraConfig,
     LampConfig,

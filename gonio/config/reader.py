@@ -1,7 +1,7 @@
 """One strict reader of TOML: every key is asked for by name, and what nobody asked for is an error.
 
 It gathers all problems of a document, each with its line, before it raises. It fills no gaps by guessing, and it knows
-nothing of what the values mean; the sections are read in `gonio.config.rig` and `gonio.config.documents`.
+nothing of what the values mean; the sections are read in the modules beside it.
 """
 
 from __future__ import annotations

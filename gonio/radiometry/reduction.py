@@ -44,7 +44,7 @@ from gonio.calibration import (
     white_block,
 )
 from gonio.config import RigConfig
-from gonio.config.rig import COUNTS_PER_TURN
+from gonio.config.axis import COUNTS_PER_TURN
 from gonio.errors import MeasurementError
 from gonio.geometry import angles
 from gonio.interfaces import Frame

@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 from gonio.config import AxisConfig, RigConfig, ZoneConfig
-from gonio.config.rig import COUNTS_PER_TURN
+from gonio.config.axis import COUNTS_PER_TURN
 from gonio.errors import LimitError
 
 Range = tuple[float, float]
