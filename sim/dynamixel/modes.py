@@ -1,4 +1,4 @@
-"""Operating and drive modes: which goal each has, what a register may hold as things are, and what the readings say.
+"""Operating and drive modes: each one's goal and the way there, what a register may hold, and what the readings say.
 
 Functions of a control table and a drive; when they apply is the business of `sim.dynamixel.servo`.
 
@@ -9,12 +9,14 @@ ROBOTIS e-Manual, XM430-W350, "Drive Mode(10)", "Operating Mode(11)", "Moving St
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
+from sim.dynamixel import motion
 from sim.dynamixel.control_table import Model, Register
 from sim.dynamixel.drive import Drive
 from sim.dynamixel.memory import Memory, Refused
-from sim.dynamixel.motion import VELOCITY_UNIT
+from sim.dynamixel.motion import ACCELERATION_UNIT, COUNTS_PER_TURN, VELOCITY_UNIT
 from sim.dynamixel.packet import ErrorNumber
 
 CURRENT, VELOCITY, POSITION, EXTENDED, CURRENT_POSITION, PWM = 0, 1, 3, 4, 5, 16  # operating modes
@@ -32,6 +34,21 @@ _LIMITS = {100: "PWM Limit", 102: "Current Limit", 104: "Velocity Limit"}
 def sign(memory: Memory) -> int:
     """-1 in reverse mode, else 1: direction of the readings against the shaft's."""
     return -1 if memory["Drive Mode"] & REVERSE else 1
+
+
+def homing_offset(memory: Memory) -> int:
+    """Homing Offset, which position mode ignores beyond a quarter turn, and reverse mode does not turn."""
+    offset = memory["Homing Offset"]
+    beyond = memory["Operating Mode"] == POSITION and abs(offset) > COUNTS_PER_TURN // 4
+    return 0 if beyond else offset
+
+
+def initial_goals(memory: Memory) -> None:
+    """What a mode begins with: no goal of its own kind, and no bound of effort or current but the user's limits."""
+    mode = memory["Operating Mode"]
+    memory["Goal PWM"] = memory["PWM Limit"] if mode != PWM else 0
+    if "Goal Current" in memory:
+        memory["Goal Current"] = memory["Current Limit"] if mode != CURRENT else 0
 
 
 def check(memory: Memory, model: Model, firmware: int, register: Register, value: int) -> None:
@@ -66,6 +83,45 @@ def check(memory: Memory, model: Model, firmware: int, register: Register, value
         lower = -upper
     if not lower <= value <= upper:
         raise Refused(ErrorNumber.DATA_LIMIT)
+
+
+def start(memory: Memory, drive: Drive, model: Model, fold: int, t: float) -> None:
+    """Start towards the goal of the operating mode.
+
+    Parameters
+    ----------
+    memory : Memory
+    drive : Drive
+    model : Model
+    fold : int
+        Counts of whole turns that the registers leave out.
+    t : float
+        [s]
+    """
+    mode = memory["Operating Mode"]
+    unit = model.motor.current_unit_a or 0.0
+    effort = 1.0 if mode == PWM else abs(memory["Goal PWM"]) / FULL_PWM
+    current = abs(memory["Goal Current"]) * unit if mode in (CURRENT, CURRENT_POSITION) else math.inf
+    acceleration = memory["Profile Acceleration"] * ACCELERATION_UNIT or math.inf
+    if mode == VELOCITY:
+        goal_velocity = sign(memory) * memory["Goal Velocity"] * VELOCITY_UNIT
+        drive.spin(t, goal_velocity, acceleration, effort=effort, current=current)
+    elif mode == PWM:
+        share = sign(memory) * memory["Goal PWM"] / FULL_PWM
+        drive.spin(t, share * drive.fastest, math.inf, effort=abs(share), current=current)
+    elif mode == CURRENT:
+        direction = sign(memory) * (memory["Goal Current"] > 0) - sign(memory) * (memory["Goal Current"] < 0)
+        drive.spin(t, direction * effort * drive.fastest, math.inf, effort=effort, current=current)
+    else:
+        goal = sign(memory) * (memory["Goal Position"] - homing_offset(memory) + fold)
+        velocity = memory["Profile Velocity"] * VELOCITY_UNIT or math.inf
+        if memory["Drive Mode"] & TIME_BASED:
+            distance = goal - drive.trajectory.at(t)[0]
+            velocity, acceleration = motion.limits_of_times(
+                distance, 1e-3 * memory["Profile Velocity"], 1e-3 * memory["Profile Acceleration"]
+            )
+        stiffness = math.inf if memory["Position I Gain"] else memory["Position P Gain"] / 128.0 / FULL_PWM
+        drive.go(t, goal, velocity, acceleration, stiffness=stiffness, effort=effort, current=current)
 
 
 def refresh(memory: Memory, drive: Drive, model: Model, reading: Callable[[float], int], t: float) -> None:

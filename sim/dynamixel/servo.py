@@ -19,27 +19,23 @@ import functools
 import math
 from collections.abc import Callable
 
-from sim.dynamixel import motion
 from sim.dynamixel.control_table import XM430_W350, Model, Register
 from sim.dynamixel.drive import Drive
 from sim.dynamixel.faults import INPUT_VOLTAGE, OVERHEATING, OVERLOAD, Fault
 from sim.dynamixel.load import Load
 from sim.dynamixel.memory import Memory, Refused
 from sim.dynamixel.modes import (
-    CURRENT,
-    CURRENT_POSITION,
-    FULL_PWM,
     GOAL_OF_MODE,
     POSITION,
-    PWM,
-    TIME_BASED,
     TORQUE_BY_GOAL,
-    VELOCITY,
     check,
+    homing_offset,
+    initial_goals,
     refresh,
     sign,
+    start,
 )
-from sim.dynamixel.motion import ACCELERATION_UNIT, COUNTS_PER_TURN, VELOCITY_UNIT
+from sim.dynamixel.motion import COUNTS_PER_TURN
 from sim.dynamixel.packet import ErrorNumber
 
 __all__ = ["Refused", "Servo"]
@@ -337,24 +333,11 @@ class Servo:
                 self._memory[name] = self.model.by_name[name].default
             self._memory["Profile Acceleration"] = 0
             self._memory["Profile Velocity"] = 0
-            self._memory["Goal PWM"] = self._memory["PWM Limit"] if value != PWM else 0
-            if "Goal Current" in self._memory:
-                self._memory["Goal Current"] = self._memory["Current Limit"] if value != CURRENT else 0
-
-    @property
-    def _sign(self) -> int:
-        return sign(self._memory)
-
-    @property
-    def _offset(self) -> int:
-        """Homing Offset, which position mode ignores beyond a quarter turn, and reverse mode does not turn."""
-        offset = self._memory["Homing Offset"]
-        beyond = self._memory["Operating Mode"] == POSITION and abs(offset) > COUNTS_PER_TURN // 4
-        return 0 if beyond else offset
+            initial_goals(self._memory)
 
     def _reading(self, raw: float) -> int:
         """Encoder counts as the registers have them."""
-        return round(self._sign * raw - self._fold) + self._offset
+        return round(sign(self._memory) * raw - self._fold) + homing_offset(self._memory)
 
     # ---- motion ------------------------------------------------------------------------------------------------
 
@@ -365,15 +348,12 @@ class Servo:
         self._goal_pending = False
         self._registered = None
         self._last_instruction = t
-        mode = self._memory["Operating Mode"]
-        self._memory["Goal PWM"] = self._memory["PWM Limit"] if mode != PWM else 0
-        if "Goal Current" in self._memory:
-            self._memory["Goal Current"] = self._memory["Current Limit"] if mode != CURRENT else 0
+        initial_goals(self._memory)
         self._fold_position(t)
 
     def _fold_position(self, t: float) -> None:
         """Make Present Position start within one turn; the shaft does not move."""
-        position = self._sign * self._drive.shaft.at(t)[0]
+        position = sign(self._memory) * self._drive.shaft.at(t)[0]
         self._fold = COUNTS_PER_TURN * (round(position) // COUNTS_PER_TURN)
 
     def _torque_on(self, t: float) -> None:
@@ -406,32 +386,8 @@ class Servo:
 
     def _go(self, t: float) -> None:
         """Start towards the goal of the operating mode."""
-        memory, drive = self._memory, self._drive
         self._goal_pending = False
-        mode = memory["Operating Mode"]
-        unit = self.model.motor.current_unit_a or 0.0
-        effort = 1.0 if mode == PWM else abs(memory["Goal PWM"]) / FULL_PWM
-        current = abs(memory["Goal Current"]) * unit if mode in (CURRENT, CURRENT_POSITION) else math.inf
-        acceleration = memory["Profile Acceleration"] * ACCELERATION_UNIT or math.inf
-        if mode == VELOCITY:
-            goal_velocity = self._sign * memory["Goal Velocity"] * VELOCITY_UNIT
-            drive.spin(t, goal_velocity, acceleration, effort=effort, current=current)
-        elif mode == PWM:
-            share = self._sign * memory["Goal PWM"] / FULL_PWM
-            drive.spin(t, share * drive.fastest, math.inf, effort=abs(share), current=current)
-        elif mode == CURRENT:
-            direction = self._sign * (memory["Goal Current"] > 0) - self._sign * (memory["Goal Current"] < 0)
-            drive.spin(t, direction * effort * drive.fastest, math.inf, effort=effort, current=current)
-        else:
-            goal = self._sign * (memory["Goal Position"] - self._offset + self._fold)
-            velocity = memory["Profile Velocity"] * VELOCITY_UNIT or math.inf
-            if memory["Drive Mode"] & TIME_BASED:
-                distance = goal - drive.trajectory.at(t)[0]
-                velocity, acceleration = motion.limits_of_times(
-                    distance, 1e-3 * memory["Profile Velocity"], 1e-3 * memory["Profile Acceleration"]
-                )
-            stiffness = math.inf if memory["Position I Gain"] else memory["Position P Gain"] / 128.0 / FULL_PWM
-            drive.go(t, goal, velocity, acceleration, stiffness=stiffness, effort=effort, current=current)
+        start(self._memory, self._drive, self.model, self._fold, t)
 
     # ---- what happens by itself --------------------------------------------------------------------------------
 
