@@ -28,7 +28,7 @@ from gonio.integrate.grid import BLOCK, Gradients
 Array = NDArray[np.float64]
 Profile = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
-_NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no digits are left to agree
+_NOTHING = 1e-24  # of the largest value: what is fainter has no digits of its own where it falls to 0
 _STEEP = 30.0  # ratio of the values of a piece from which on it is their logarithm that is a polynomial
 _SHORT = 0.4  # of the tolerance, for the samples, whose share is an eighth: more than they should take
 _DEEPEST = 40  # halvings
