@@ -221,7 +221,7 @@ def one_piece(rings, flipped, layer, sin_gamma):  # type: ignore[no-untyped-def]
         rings[8, i], rings[9, i], rings[10, i], rings[11, i], rings[12, i] = u0, u1, e4, v, edge
 
 
-@jit.model
+@jit.part
 def lay(u0, u1, e4, v, at_a, a, b, near, edge, sign, x, w, arc, m):  # type: ignore[no-untyped-def]
     """The nodes of one `half_ring` into rows of `arc` (cosine, sine, weight) from m on; their new number."""
     n = x.size
@@ -235,7 +235,7 @@ def lay(u0, u1, e4, v, at_a, a, b, near, edge, sign, x, w, arc, m):  # type: ign
     return m
 
 
-@jit.part
+@jit.model
 def element_nodes(  # type: ignore[no-untyped-def]
     cos_n, sin_n, axis, half_angle, about_normal, width, depth, planes, symmetric, x, w, scratch, nodes, count
 ):
@@ -281,24 +281,23 @@ def element_nodes(  # type: ignore[no-untyped-def]
             if t <= 0.0 or t >= g[11] or (about_normal and ct[i] <= 0.0) or not reach[i] > 0.0:
                 continue
             m = 0
-            if single:
-                a = math.pi - reach[i] if flipped else 0.0
-                b = math.pi if flipped else reach[i]
-                near, sign = rings[12, i], -1.0 if flipped else 1.0
-                m = lay(
-                    rings[8, i], rings[9, i], rings[10, i], rings[11, i], flipped and near < b - a, a, b, near, near,
-                    sign, x, w, arc, m,
-                )  # fmt: skip
-            else:
-                n_points, whole = arcs(reach[i], st[i], ct[i], symmetric, planes, g, points)
-                for piece in range(n_points - 1):
+            n_points, whole = (2, False) if single else arcs(reach[i], st[i], ct[i], symmetric, planes, g, points)
+            for piece in range(n_points - 1):
+                if m + 2 * n > arc.shape[1]:
+                    return -1
+                near = edge = 10.0
+                if single:
+                    even = not flipped
+                    a, b = (0.0, reach[i]) if even else (math.pi - reach[i], math.pi)
+                    p0, p1, e4, v, near = rings[8, i], rings[9, i], rings[10, i], rings[11, i], rings[12, i]
+                    edge, at_a = near, flipped and near < b - a
+                else:
                     c0, c1 = points[piece] - chi_m, points[piece + 1] - chi_m
                     turn = math.floor(0.5 * (c0 + c1) / math.pi)
                     even = turn % 2 == 0  # the lobe is at even multiples of pi
                     a = c0 - turn * math.pi if even else (turn + 1) * math.pi - c1
                     b = c1 - turn * math.pi if even else (turn + 1) * math.pi - c0
                     a, b = max(a, 0.0), min(b, math.pi)
-                    near = edge = 10.0
                     first, last = piece == 0 and not symmetric, piece == n_points - 2
                     if layered and not whole and (first or last):
                         slope = sin_gamma * st[i] * abs(math.sin((c1 if last else c0) + chi_m))
@@ -306,11 +305,10 @@ def element_nodes(  # type: ignore[no-untyped-def]
                             edge = layer / max(slope, 1e-300)
                         else:
                             near = layer / max(slope, 1e-300)
-                    if m + 2 * n > arc.shape[1]:
-                        return -1
-                    if b > a:
-                        p0, p1, e4, v, at_a = half_ring(a, b, eps[i], near, edge)
-                        m = lay(p0, p1, e4, v, at_a, a, b, near, edge, 1.0 if even else -1.0, x, w, arc, m)
+                    if not b > a:
+                        continue
+                    p0, p1, e4, v, at_a = half_ring(a, b, eps[i], near, edge)
+                m = lay(p0, p1, e4, v, at_a, a, b, near, edge, 1.0 if even else -1.0, x, w, arc, m)
             if count + m > nodes.shape[1]:
                 return -1
             out_x, out_y, out_z = nodes[0, count : count + m], nodes[1, count : count + m], nodes[2, count : count + m]

@@ -28,7 +28,8 @@ from gonio.integrate.grid import BLOCK, Gradients
 Array = NDArray[np.float64]
 Profile = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
-_NOTHING = 1e-24  # of the largest value: what is fainter has no digits of its own where it falls to 0
+_NOTHING = 1e-30  # of the largest value: the tail of a lobe underflows, and no digits are left to agree
+_FAINT = 1e-24  # of it: what is fainter and not a tail, but falls to 0, has no digits of its own
 _STEEP = 30.0  # ratio of the values of a piece from which on it is their logarithm that is a polynomial
 _SHORT = 0.4  # of the tolerance, for the samples, whose share is an eighth: more than they should take
 _DEEPEST = 40  # halvings
@@ -155,9 +156,9 @@ def tabulate(
         finer = np.array([piece[3] for piece in pending])
         value, sampled = profile(a + 0.5 * (b - a) * (places + 1.0), finer)
         top = max(top, float(np.max(np.abs(value))))
-        absolute = max(atol, _NOTHING * top)
+        absolute = max(atol, _FAINT * top)
         least, most = np.min(value, axis=1), np.max(value, axis=1)
-        steep = (least > 10.0 * absolute / rtol) & (most > _STEEP * least)  # samples are good to `absolute`
+        steep = (least > 10.0 * max(atol, _NOTHING * top) / rtol) & (most > _STEEP * least)  # samples are good to `absolute`
         value[steep], sampled[steep] = np.log(value[steep]), sampled[steep] / value[steep]
         series = value[:, : degree + 1] @ to_series.T
         missed = np.max(np.abs(series @ at_probes.T - value[:, degree + 1 :]), axis=1)
