@@ -1,4 +1,4 @@
-"""The servo driver against the protocol-level simulator, through the vendor's SDK, on a virtual clock.
+"""The servo driver against the protocol-level simulator, through the vendor's SDK, on a virtual clock: settings and motion.
 
 The truths come from the simulator's own side of the line: its registers, its shaft, its log of instructions.
 """
@@ -7,101 +7,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import pytest
 
 from drivers.dynamixel import Bus, Servo
-from gonio.errors import (
-    ConfigurationError,
-    DeviceError,
-    DeviceTimeoutError,
-    HardwareStatusError,
-    LimitError,
-)
+from gonio.errors import ConfigurationError, LimitError
 from gonio.interfaces import Axis
-from sim import port
-from sim.clock import VirtualClock
-from sim.dynamixel.bus import DynamixelBus
 from sim.dynamixel.control_table import XL330_M288, XL430_W250, Model
-from sim.dynamixel.faults import Fault
-from sim.dynamixel.servo import Servo as SimServo
+from tests.servo_bench import DEG, POLL_S, Bench
 
-DEG = math.pi / 180.0
 COUNT = 2.0 * math.pi / 4096.0
-POLL_S = 0.02
-
-
-@dataclass
-class Rig:
-    """One simulated servo, and the driver that drives it."""
-
-    clock: VirtualClock
-    sim: SimServo
-    line: DynamixelBus
-    bus: Bus
-
-    def servo(self, **changes: object) -> Servo:
-        options: dict[str, object] = {
-            "lower": -100 * DEG,
-            "upper": 100 * DEG,
-            "velocity": 60 * DEG,
-            "acceleration": 300 * DEG,
-        }
-        return Servo(self.bus, "arm", 1, **(options | changes))  # type: ignore[arg-type]
-
-    def connected(self, **changes: object) -> Servo:
-        servo = self.servo(**changes)
-        servo.connect()
-        return servo
-
-    def finish(self, servo: Servo) -> list[int]:
-        """Poll until settled; the goals seen on the way."""
-        goals: list[int] = []
-        for _ in range(5000):
-            goal = self.register(116, 4)
-            if not goals or goals[-1] != goal:
-                goals.append(goal)
-            if servo.settled():
-                return goals
-            self.clock.sleep(POLL_S)
-        raise AssertionError("never settled")
-
-    def register(self, address: int, size: int) -> int:
-        return int.from_bytes(self.sim.read(address, size, self.clock.now()), "little", signed=True)
-
-    def writes(self, address: int) -> int:
-        """Write instructions to this address so far."""
-        return sum(p.instruction == 3 and int.from_bytes(p.params[:2], "little") == address for _, p in self.line.log)
-
-
-class Bench:
-    """Makes rigs, and takes them off the process-wide list of simulated ports."""
-
-    def __init__(self) -> None:
-        self.buses: list[Bus] = []
-
-    def __call__(self, faults: Sequence[Fault] = (), *, attempts: int = 3, **servo: object) -> Rig:
-        clock = VirtualClock()
-        sim = SimServo(1, **servo)  # type: ignore[arg-type]
-        line = DynamixelBus([sim], faults)
-        url = port.attach(f"driver-{len(self.buses)}", line, clock)
-        bus = Bus(url, clock=clock, now=clock.now, attempts=attempts).open()
-        self.buses.append(bus)
-        return Rig(clock, sim, line, bus)
-
-    def close(self) -> None:
-        for k, bus in enumerate(self.buses):
-            bus.close()
-            port.detach(f"driver-{k}")
-
-
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    bench = Bench()
-    yield bench
-    bench.close()
 
 
 def test_satisfies_the_axis_protocol(bench: Bench) -> None:
@@ -300,32 +215,6 @@ def test_bus_stop_ends_the_move_of_every_servo(bench: Bench) -> None:
     assert rig.sim.shaft_counts(rig.clock.now()) == pytest.approx(seen, abs=8)
 
 
-def test_overload_says_what_happened_and_that_torque_is_off(bench: Bench) -> None:
-    rig = bench([Fault("hardware", at_goal_write=1, after_s=0.3)])
-    servo = rig.connected()
-    servo.move_to(90 * DEG)
-    with pytest.raises(HardwareStatusError, match=r"Axis arm \(id 1 .*overload.*torque is off.*reboot"):
-        rig.finish(servo)
-    with pytest.raises(HardwareStatusError):
-        servo.read()
-
-
-def test_hardware_error_at_connect(bench: Bench) -> None:
-    rig = bench([Fault("hardware", at_time_s=0.0, bits=0x04)])
-    with pytest.raises(HardwareStatusError, match="overheating"):
-        rig.connected()
-
-
-def test_stall_names_goal_and_position_and_lets_go(bench: Bench) -> None:
-    rig = bench([Fault("stuck", at_goal_write=1, after_s=0.5)])
-    servo = rig.connected()
-    servo.move_to(90 * DEG)
-    with pytest.raises(DeviceError, match=r"no progress for 2 s: it stands at \d+\.\d\d deg.*goal is 90\.00 deg"):
-        rig.finish(servo)
-    assert rig.register(116, 4) == pytest.approx(rig.sim.shaft_counts(rig.clock.now()), abs=2)
-    assert rig.sim.torque
-
-
 def test_current_and_pwm_limits_are_written_and_read_back(bench: Bench) -> None:
     rig = bench()
     rig.sim.write(64, b"\x01", 0.0)
@@ -365,108 +254,6 @@ def test_a_model_without_a_current_sensor_has_a_pwm_limit(bench: Bench) -> None:
     assert rig.register(36, 2) == 708
     with pytest.raises(ConfigurationError, match=r"Axis arm: XL430-W250 has no current sensor.*use pwm_limit"):
         bench(model=XL430_W250).servo(model="XL430-W250", current_limit=0.5)
-
-
-def test_too_much_current_stops_the_move_and_names_both_currents(bench: Bench) -> None:
-    """An obstacle: the servo pushes with its stall current, 2.3 A, long before the move counts as stalled."""
-    rig = bench([Fault("obstacle", at_goal_write=1, after_s=0.5, ahead_counts=5.0)])
-    servo = rig.connected(current_limit=1.0)
-    servo.move_to(90 * DEG)
-    with pytest.raises(DeviceError, match=r"draws 2\.\d\d A at \d+\.\d\d deg .*to 90\.00 deg, its limit is 1\.00 A"):
-        rig.finish(servo)
-    assert rig.clock.now() < 1.3
-    assert rig.sim.torque
-    assert rig.register(116, 4) == pytest.approx(rig.sim.shaft_counts(rig.clock.now()), abs=2)
-
-
-def test_the_current_of_a_move_is_not_too_much(bench: Bench) -> None:
-    rig = bench()
-    servo = rig.connected(current_limit=1.0)
-    for angle in (60.0, -60.0, 0.0):
-        servo.move_to(angle * DEG)
-        rig.finish(servo)
-
-
-def test_a_servo_that_falls_silent(bench: Bench) -> None:
-    rig = bench([Fault("silent", servo_id=1, at_goal_write=1)])
-    servo = rig.connected()
-    with pytest.raises(DeviceTimeoutError, match=r"Axis arm \(id 1 on sim://.*no answer within 0.5 s.*check its power"):
-        servo.move_to(40 * DEG)
-        rig.finish(servo)
-    with pytest.raises(DeviceTimeoutError, match="cut the power"):
-        rig.bus.stop_all()
-
-
-def test_a_servo_that_loses_its_torque(bench: Bench) -> None:
-    rig = bench()
-    servo = rig.connected()
-    servo.move_to(40 * DEG)
-    rig.clock.sleep(0.3)
-    rig.sim.reboot(rig.clock.now())
-    with pytest.raises(DeviceError, match="lost its torque"):
-        rig.finish(servo)
-
-
-def test_watchdog_stops_a_servo_that_nobody_asks(bench: Bench) -> None:
-    rig = bench()
-    servo = rig.connected(watchdog_s=0.2)
-    servo.move_to(90 * DEG)
-    rig.clock.sleep(0.3)
-    rig.clock.sleep(5.0)
-    assert rig.sim.shaft_counts(rig.clock.now()) < 2048 + 0.5 * 1024
-    with pytest.raises(DeviceError, match="own watchdog"):
-        rig.finish(servo)
-    assert rig.register(112, 4) == 43  # a tripped watchdog clears the profile
-    servo.move_to(10 * DEG)
-    rig.finish(servo)
-    assert rig.register(98, 1) == 0
-
-
-def test_outside_its_limits_at_connect_it_stays_loose(bench: Bench) -> None:
-    rig = bench(initial_counts=3500.0)
-    with pytest.raises(LimitError, match=r"stands at 127\.\d+ deg, outside its limits of -100 to 100 deg"):
-        rig.connected()
-    assert not rig.sim.torque
-
-
-def test_wrong_model(bench: Bench) -> None:
-    with pytest.raises(DeviceError, match=r"model number 1020 \(XM430-W350\), rig.toml says XL430-W250"):
-        bench().connected(model="XL430-W250")
-
-
-def test_before_connect_nothing_moves(bench: Bench) -> None:
-    rig = bench()
-    servo = rig.servo()
-    with pytest.raises(DeviceError, match="not connected"):
-        servo.move_to(0.0)
-    assert not rig.line.log
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"lower": 10 * DEG, "upper": -10 * DEG}, "not below"),
-        ({"upper": 190 * DEG}, "counts 910 to 4210"),
-        ({"direction": 2}, "direction 2"),
-        ({"model": "AX-12"}, "'AX-12' is not known"),
-        ({"velocity": 0.0}, "above 0"),
-        ({"overshoot": 0.5 * DEG}, "overshoot 0.5 deg"),
-        ({"approach": "sideways"}, "up, down or any"),
-        ({"watchdog_s": 3.0}, "0 to 2.54"),
-        ({"current_limit": 5.0}, r"current limit 5 A is outside 0 to 3\.21 A of XM430-W350"),
-        ({"pwm_limit": 1.2}, r"PWM limit 1\.2 is outside 0 to 1"),
-    ],
-)
-def test_parameters_outside_their_range(bench: Bench, changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message):
-        bench().servo(**changes)
-
-
-def test_two_axes_with_one_id(bench: Bench) -> None:
-    rig = bench()
-    rig.servo()
-    with pytest.raises(ConfigurationError, match="both have id 1"):
-        rig.servo()
 
 
 @pytest.mark.parametrize("level", [0, 1])
