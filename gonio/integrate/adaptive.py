@@ -300,7 +300,6 @@ class _Block:
             )
         return out[0], _SAFETY * np.abs(out[0] - out[1]), _SAFETY * np.abs(out[0] - out[2])
 
-
     def _integrand(self, base: Index, box: Array, x: Array) -> tuple[Array, Array]:
         """f_r times the radiance, and the weights, at nodes x by x of each cell, shape (c, k, k)."""
         size, side = len(base), x.size

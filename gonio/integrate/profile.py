@@ -7,19 +7,26 @@ rate of convergence, is small tells that the nodes are no worse than the probes.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from gonio.brdf.base import Term
 from gonio.integrate import radial
-from gonio.integrate.quadrature import EPS, ORDERS, Effort, first_orders, integrate_cap, order_sums, rounding, scene_of
+from gonio.integrate.quadrature import (
+    EPS,
+    Effort,
+    first_orders,
+    integrate_cap,
+    lit_elements,
+    order_sums,
+    orders_of,
+    rounding,
+    scene_of,
+)
 from gonio.source import Cap
 
 Array = NDArray[np.float64]
 _SAFETY = 3.0  # of the difference of two orders, as an error of the lower one at all places
-_KINKED = len(ORDERS) - 3  # orders that are tried where there are kinks: cells are next
 _LEAST = 1e-5  # rtol by which the first order is chosen: the least that resolves the features
 
 
@@ -71,9 +78,9 @@ def sample(
         np.maximum.at(first, group, first_orders(scene, _LEAST))
         exact = rounding(scene)
         limit = np.maximum(rtol, _SAFETY * exact)  # of relative errors
-        lit = scene.axis[:, 2] > -math.sin(min(cap.half_angle, math.pi / 2))
+        lit = lit_elements(scene)
         probe = lit & (np.arange(tau.size) % places >= places - probes)
-        orders = ORDERS[:_KINKED] if scene.planes.shape[1] else ORDERS
+        orders = orders_of(scene)
 
         def advance(active: NDArray[np.intp], k: int) -> Array:
             """Sums of order k into `value`; how they differ from what was there, in units of the limit."""

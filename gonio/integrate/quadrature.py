@@ -123,9 +123,7 @@ def integrate_cap(
     scene = scene_of(term, cap, elements, about_normal)
     n = len(elements)
     value, error = np.zeros(n), np.zeros(n)
-    lit = np.ones(n, dtype=np.bool_)
-    if cap.half_angle < math.pi / 2:  # else the whole cap may be below the horizon of an element
-        lit = scene.axis[:, 2] > -math.sin(cap.half_angle)
+    lit = lit_elements(scene)
     unit = rounding(scene)
     first = first_orders(scene, rtol)
     done = ~lit
@@ -133,7 +131,7 @@ def integrate_cap(
     kinked = scene.planes.shape[1] > 0
     crossed = lit & _rim_crosses_kink(scene) if kinked and cautious else np.zeros(n, dtype=np.bool_)
     done |= crossed
-    for k, order in enumerate(ORDERS[:-3] if kinked else ORDERS):
+    for k, order in enumerate(orders_of(scene)):
         active = np.flatnonzero(~done & (first <= k))
         if not active.size:
             continue
@@ -180,6 +178,7 @@ def _blind(scene: _Scene, none: NDArray[np.bool_], error: Array) -> NDArray[np.b
 
 
 def scene_of(term: Term, cap: Cap, elements: Elements, about_normal: bool | None) -> _Scene:
+    """What the rules need to know of a term, a cap and surface elements; arguments as of `integrate_cap`."""
     axis = np.ascontiguousarray(elements.local(cap.axis))
     n, width = len(elements), term.lobe_width() or _NO_LOBE
     if not term.kinked:
@@ -204,6 +203,18 @@ def scene_of(term: Term, cap: Cap, elements: Elements, about_normal: bool | None
     cos_n = np.maximum(elements.cos_theta, _LIMB)
     depth = term.layer_width() if term.model.shadowed else NO_LAYER
     return _Scene(term, cap, cos_n, elements.sin_theta, axis, local, width, depth, planes, symmetric)
+
+
+def lit_elements(scene: _Scene) -> NDArray[np.bool_]:
+    """Elements above whose horizon some of the cap is."""
+    if scene.cap.half_angle > math.pi / 2:
+        return np.ones(len(scene.cos_n), dtype=np.bool_)
+    return np.asarray(scene.axis[:, 2] > -math.sin(scene.cap.half_angle))
+
+
+def orders_of(scene: _Scene) -> tuple[int, ...]:
+    """Orders that may be tried: where there are kinks, cells are next after the first few."""
+    return ORDERS[:-3] if scene.planes.shape[1] else ORDERS
 
 
 def _rim_crosses_kink(scene: _Scene) -> NDArray[np.bool_]:
