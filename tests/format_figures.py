@@ -3,8 +3,8 @@
     python -m tests.format_figures
 
 which prints the table of docs/formats.md and writes it there. Truth is the BRDF that was exported, evaluated directly.
-A figure of a format that no third-party program reads comes from a reader in this file, written from the format's definition
-and sharing no code with gonio's.
+A figure of a format that no third-party program reads comes from a reader here or in `tests.format_readers`, written from
+the format's definition and sharing no code with gonio's.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 import platform
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,12 +28,12 @@ from gonio.brdf.tabulated import tabulate
 from gonio.formats import Material, klems, peers, rgl
 from gonio.geometry import unit_vector
 from tests import materials
+from tests.format_readers import Reader, albedo, binned_albedo, patch_points, random_pairs, ssdd_reader
 
 Array = NDArray[np.float64]
 BLACK = Path(__file__).parent / "data" / "optics-blacks" / "AnoBlackEC1onAlum.bsdf"
 PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
 BEGIN, END = "<!-- figures: written by python -m tests.format_figures -->", "<!-- end of figures -->"
-Reader = Callable[[Array, Array], Array]  # omega_i, omega_r (n, 3) -> f_r (n,)
 
 
 @dataclass(frozen=True)
@@ -62,48 +61,6 @@ def measured_table() -> Material:
     found = formats.material_of(tabulate(formats.read_samples(BLACK)))
     assert found is not None
     return found
-
-
-def random_pairs(n: int, seed: int, reach_deg: float = 75.0) -> tuple[Array, Array]:
-    """Pairs of directions, half of them around the mirror direction."""
-    rng = np.random.default_rng(seed)
-    cos = rng.uniform(math.cos(math.radians(reach_deg)), 1.0, (2, n))
-    wi, wr = (unit_vector(np.arccos(c), rng.uniform(0, 2 * np.pi, n)) for c in cos)
-    near = wi * [-1.0, -1.0, 1.0] + 0.1 * rng.standard_normal((n, 3))
-    near /= np.linalg.norm(near, axis=1, keepdims=True)
-    take = (np.arange(n) % 2 == 0) & (near[:, 2] > math.cos(math.radians(reach_deg)))
-    return wi, np.where(take[:, None], near, wr)
-
-
-def albedo(read: Reader, theta_i: float, n: int = 96) -> float:
-    """Directional albedo by Gauss quadrature in half-vector angles around the mirror direction."""
-    node, weight = np.polynomial.legendre.leggauss(n)
-    wi = np.array([math.sin(theta_i), 0.0, math.cos(theta_i)])
-    # theta_h = u^3 pi/2: nodes crowd at the lobe; d omega_r = 4 cos(theta_d) d omega_h
-    u, w_u = 0.5 * (node + 1), 0.5 * weight
-    theta_h, d_theta = u**3 * np.pi / 2, 1.5 * np.pi * u**2
-    phi = np.pi * (np.arange(4 * n) + 0.5) / (4 * n) * 2
-    h = unit_vector(theta_h[:, None], phi)
-    dot = h @ wi
-    wr = 2 * dot[..., None] * h - wi
-    up = (dot > 0) & (wr[..., 2] > 1e-6)
-    jacobian = 4 * dot * np.sin(theta_h)[:, None] * (d_theta * w_u)[:, None] * (2 * np.pi / len(phi))
-    f = read(np.broadcast_to(wi, wr[up].shape), wr[up])
-    return float(np.sum(f * wr[up][:, 2] * jacobian[up]))
-
-
-def binned_albedo(read: Reader, theta_i: float, per_bin: int = 20, azimuths: int = 90) -> float:
-    """Directional albedo of a look-up in MERL's bins, by midpoints within each bin of theta_h and random azimuths."""
-    rng, n = np.random.default_rng(4), 90 * per_bin
-    wi = np.array([math.sin(theta_i), 0.0, math.cos(theta_i)])
-    u = (np.arange(n)[:, None] + 0.5) / n  # theta_h = u^2 pi/2 as in the bins
-    theta, phi = u * u * np.pi / 2, 2 * np.pi * (np.arange(azimuths) + rng.random((n, 1))) / azimuths
-    h = unit_vector(theta, phi)
-    dot = h @ wi
-    wr = 2 * dot[..., None] * h - wi
-    up = (dot > 0) & (wr[..., 2] > 1e-6)
-    jacobian = (4 * dot * np.sin(theta) * np.pi * u * 2 * np.pi / (n * azimuths))[up]
-    return float(np.sum(read(np.broadcast_to(wi, wr[up].shape), wr[up]) * wr[up][:, 2] * jacobian))
 
 
 def compare(
@@ -228,39 +185,6 @@ def klems_figures(folder: Path, of: str, material: Material, probes: int = 40) -
             5e-3,
         ),
     ]
-
-
-def patch_points(basis: klems.Basis, patch: int, n: int, rng: np.random.Generator) -> Array:
-    """Random directions (n, 3) of a patch, even in projected solid angle."""
-    t0, t1, p0, p1 = basis.patches()[patch]
-    s2 = rng.uniform(math.sin(t0) ** 2, math.sin(t1) ** 2, n)
-    return unit_vector(np.arcsin(np.sqrt(s2)), rng.uniform(p0, p1, n))
-
-
-def ssdd_reader(path: Path) -> Reader:
-    """Linear interpolation in the four angles, as libbsdf does, from the text of the file."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    start = lines.index("DATA ascii")
-    lists = {
-        w[0]: [float(x) for x in w[1:]] for w in (line.split() for line in lines[:start]) if w and w[0].endswith("_LIST")
-    }
-    axes = [np.radians(lists[f"PARAM{k}_LIST"]) for k in (0, 2, 3)]
-    values = np.array([float(line.split()[0]) for line in lines[start + 1 :]])
-    grid = values.reshape(len(axes[2]), len(axes[1]), len(axes[0])).T
-    table = RegularGridInterpolator(axes, grid)
-
-    def read(wi: Array, wr: Array) -> Array:
-        h = (wi + wr) / np.linalg.norm(wi + wr, axis=1, keepdims=True)
-        theta_h, phi_h = np.arccos(np.clip(h[:, 2], -1, 1)), np.arctan2(h[:, 1], h[:, 0])
-        c, s = np.cos(-phi_h), np.sin(-phi_h)
-        x, y = c * wi[:, 0] - s * wi[:, 1], s * wi[:, 0] + c * wi[:, 1]
-        c, s = np.cos(-theta_h), np.sin(-theta_h)
-        dx, dz = c * x + s * wi[:, 2], -s * x + c * wi[:, 2]
-        theta_d, phi_d = np.arccos(np.clip(dz, -1, 1)), np.abs(np.arctan2(y, dx))
-        phi_d = np.minimum(phi_d, np.pi - phi_d)
-        return np.asarray(table(np.stack((theta_h, theta_d, np.maximum(phi_d, 0.0)), axis=-1)))
-
-    return read
 
 
 def grid_figures(folder: Path, of: str, material: Material, bins: float, n: int = 4000) -> list[Figure]:

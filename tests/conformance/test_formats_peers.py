@@ -16,7 +16,7 @@ import pytest
 from gonio import formats
 from gonio.formats import check, klems, peers, rgl
 from gonio.geometry import unit_vector
-from tests import format_figures, gates, materials
+from tests import format_figures, format_readers, gates, materials
 from tests.format_figures import Figure
 
 
@@ -48,7 +48,7 @@ def test_mitsuba_reads_a_grain_with_its_azimuth(tmp_path: Path) -> None:
     turned = materials.turned(math.radians(30), 0.3, 0.6)
     formats.export("rgl", tmp_path / "a.bsdf", material=turned)
     bsdf = peers.mitsuba_bsdf(tmp_path / "a.bsdf")
-    wi, wr = format_figures.random_pairs(300, 4, 60.0)
+    wi, wr = format_readers.random_pairs(300, 4, 60.0)
     found = peers.mitsuba_f_cos(bsdf, wi, wr)[:, 0] / wr[:, 2]
     mirrored = turned.evaluate(wi * [1, -1, 1], wr * [1, -1, 1])[0]
     relative, wrong = np.abs(found / turned.evaluate(wi, wr)[0] - 1), np.abs(mirrored / turned.evaluate(wi, wr)[0] - 1)
@@ -60,7 +60,7 @@ def test_mitsuba_reads_a_spectrum(tmp_path: Path) -> None:
     material = materials.spectrum(0.4)
     formats.export("rgl", tmp_path / "a.bsdf", material=material)
     bsdf = peers.mitsuba_bsdf(tmp_path / "a.bsdf", spectral=True)
-    wi, wr = format_figures.random_pairs(200, 2, 60.0)
+    wi, wr = format_readers.random_pairs(200, 2, 60.0)
     found = peers.mitsuba_f_cos(bsdf, wi, wr, material.channels.wavelengths_nm)
     np.testing.assert_allclose(found / wr[:, 2:], material.evaluate(wi, wr).T, rtol=0.015)
 
@@ -128,7 +128,7 @@ def test_text_formats_hold_the_brdf(tmp_path: Path) -> None:
 
 def test_grid_formats_between_their_nodes(tmp_path: Path) -> None:
     formats.export("ssdd", tmp_path / "a.ssdd", material=materials.single(0.3))
-    read = format_figures.ssdd_reader(tmp_path / "a.ssdd")
+    read = format_readers.ssdd_reader(tmp_path / "a.ssdd")
     told(format_figures.compare("ssdd", "linear", "paint", read, materials.single(0.3), 5e-3, 2000, 1))
     told(format_figures.netcdf_figures(tmp_path, "paint", materials.paint(0.3, 0.3), 2000))
 
